@@ -1,0 +1,248 @@
+"""The structs of the simulator: frozen pytrees, unbatched; `vmap` adds batch axes in front.
+
+Axes: T time, B environments, N agents, M towns, K lanes, P lane points, S scenarios, R route points,
+Q stop lines of a route, G speed signs of a route, D history steps. SI units and radians; float32 where
+no dtype is written. Frames are right-handed: x east, y north, yaw counter-clockwise in [-pi, pi).
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+from flax import struct
+
+KIND_NONE, KIND_VEHICLE, KIND_PEDESTRIAN, KIND_STATIC = 0, 1, 2, 3
+STOP_NONE, STOP_LIGHT, STOP_SIGN, STOP_YIELD = 0, 1, 2, 3
+LIGHT_GREEN, LIGHT_YELLOW, LIGHT_RED = 0, 1, 2
+
+
+@struct.dataclass
+class EgoState:
+    """The ego vehicle; its reference point is the centre of its box.
+
+    Attributes:
+      xy: (2,) m.
+      z: () m, height of the lane it is on.
+      yaw: () rad.
+      speed: () m/s, along the direction of motion, never negative.
+      slip: () rad, direction of motion minus yaw.
+      yaw_rate: () rad/s.
+      accel: () m/s^2, along the direction of motion over the last step.
+      steer: () in [-1, 1], last applied; positive turns left.
+      throttle: () in [0, 1], last applied.
+      brake: () in [0, 1], last applied.
+    """
+
+    xy: jax.Array
+    z: jax.Array
+    yaw: jax.Array
+    speed: jax.Array
+    slip: jax.Array
+    yaw_rate: jax.Array
+    accel: jax.Array
+    steer: jax.Array
+    throttle: jax.Array
+    brake: jax.Array
+
+
+@struct.dataclass
+class Agents:
+    """The other road users.
+
+    Attributes:
+      xy: (N, 2) m, box centre.
+      z: (N,) m.
+      yaw: (N,) rad.
+      speed: (N,) m/s.
+      yaw_rate: (N,) rad/s.
+      accel: (N,) m/s^2 over the last step.
+      length, width: (N,) m.
+      kind: (N,) int32, KIND_NONE marks an empty slot.
+      lanes: (N, 3) int32, the lane it is on and the two it will take next; -1 past a dead end.
+      lane_s: (N,) m, arc length on lanes[:, 0].
+      desired_speed_frac: (N,) this driver's free speed as a fraction of the limit.
+      has_stopped: (N,) bool, has come to rest at the stop sign ahead.
+      wait_s: (N,) s, time at rest.
+    """
+
+    xy: jax.Array
+    z: jax.Array
+    yaw: jax.Array
+    speed: jax.Array
+    yaw_rate: jax.Array
+    accel: jax.Array
+    length: jax.Array
+    width: jax.Array
+    kind: jax.Array
+    lanes: jax.Array
+    lane_s: jax.Array
+    desired_speed_frac: jax.Array
+    has_stopped: jax.Array
+    wait_s: jax.Array
+
+    @property
+    def valid(self) -> jax.Array:
+        """(N,) bool, slots in use."""
+        return self.kind != KIND_NONE
+
+
+@struct.dataclass
+class Situation:
+    """Where the ego is on the road and the route after a step: what reward and observation look up once.
+
+    Attributes:
+      lane_lateral: () m, offset from the nearest driving lane's centre, positive to its left.
+      lane_yaw: () rad, direction of travel of that lane at its nearest point.
+      lane_width: () m, its width there.
+      lane_in_junction: () bool.
+      on_parking: () bool, ego centre is on a parking lane.
+      off_road_frac: () fraction of the ego's footprint on neither road, parking nor shoulder.
+      route_idx: () int32, last passed route point.
+      route_s: () m, arc length of that point.
+      route_length: () m.
+      route_num_points: () int32.
+      route_distance: () m, to the nearest of the current and next five route points.
+      speed_limit: () m/s in force.
+      stop_xy: (Q, 2) m, centre of each stop line on the route.
+      stop_yaw: (Q,) rad, direction of travel across it.
+      stop_width: (Q,) m, lane width there.
+      stop_kind: (Q,) int32, STOP_*; STOP_NONE pads.
+      stop_light: (Q,) int32, LIGHT_* now (LIGHT_GREEN where there is no light).
+    """
+
+    lane_lateral: jax.Array
+    lane_yaw: jax.Array
+    lane_width: jax.Array
+    lane_in_junction: jax.Array
+    on_parking: jax.Array
+    off_road_frac: jax.Array
+    route_idx: jax.Array
+    route_s: jax.Array
+    route_length: jax.Array
+    route_num_points: jax.Array
+    route_distance: jax.Array
+    speed_limit: jax.Array
+    stop_xy: jax.Array
+    stop_yaw: jax.Array
+    stop_width: jax.Array
+    stop_kind: jax.Array
+    stop_light: jax.Array
+
+
+@struct.dataclass
+class History:
+    """Ego motion of the last D = 15 steps, oldest first, for the comfort filter.
+
+    Attributes:
+      accel_lon, accel_lat: (D,) m/s^2 along and left of the body.
+      yaw: (D,) rad, unwrapped.
+      num: () int32, samples taken so far in this episode (may exceed D).
+    """
+
+    accel_lon: jax.Array
+    accel_lat: jax.Array
+    yaw: jax.Array
+    num: jax.Array
+
+
+@struct.dataclass
+class RewardState:
+    """What the reward remembers within an episode.
+
+    Attributes:
+      history: see `History`.
+      ttc_ticks: () int32, steps for which the TTC penalty still holds.
+      comfort_ticks: (6,) int32, likewise for each comfort metric.
+      stopped_s: () s, time the ego has stood still.
+      far_from_route_m: () m, route length advanced while more than 15 m from it.
+      stop_satisfied: (Q,) bool, the ego has halted at this stop sign.
+      line_crossed: (Q,) bool, this stop line lies behind the ego's rear.
+    """
+
+    history: History
+    ttc_ticks: jax.Array
+    comfort_ticks: jax.Array
+    stopped_s: jax.Array
+    far_from_route_m: jax.Array
+    stop_satisfied: jax.Array
+    line_crossed: jax.Array
+
+
+@struct.dataclass
+class RewardTerms:
+    """One step's reward, taken apart.
+
+    Attributes:
+      progress: () route completion gained, percent points.
+      soft: {name: () in [0, 1]} factors.
+      terminated: {name: () bool} causes that end the episode.
+      finished: () bool, the route's end was reached.
+      penalty: () the terminal penalty.
+    """
+
+    progress: jax.Array
+    soft: dict[str, jax.Array]
+    terminated: dict[str, jax.Array]
+    finished: jax.Array
+    penalty: jax.Array
+
+
+@struct.dataclass
+class SimState:
+    """The whole state of one environment: a few kB, no map and no image.
+
+    Attributes:
+      ego, agents: see above.
+      reward_state: see `RewardState`.
+      scenario_idx: () int32 into the bank.
+      route_idx: () int32, last passed route point.
+      light_time: () s, clock of the traffic lights (starts at a random phase).
+      step_count: () int32.
+      key: () PRNG key.
+    """
+
+    ego: EgoState
+    agents: Agents
+    reward_state: RewardState
+    scenario_idx: jax.Array
+    route_idx: jax.Array
+    light_time: jax.Array
+    step_count: jax.Array
+    key: jax.Array
+
+
+@struct.dataclass
+class Observation:
+    """What the policy sees.
+
+    Attributes:
+      raster: (H, W, C) uint8.
+      scalars: (8,) steer, throttle, brake, gear, v_x, v_y, forward speed, speed limit (m/s).
+      value_scalars: (10,) seen by the critic only.
+    """
+
+    raster: jax.Array
+    scalars: jax.Array
+    value_scalars: jax.Array
+
+
+@struct.dataclass
+class State:
+    """What `reset` and `step` return (Brax's names).
+
+    Attributes:
+      pipeline_state: SimState.
+      obs: Observation.
+      reward: ().
+      done: () 1.0 where the episode ended, for any cause.
+      metrics: {name: ()}, the same keys from reset and step.
+      info: {"truncation": () 1.0 where it ended without failure}.
+    """
+
+    pipeline_state: SimState
+    obs: Observation
+    reward: jax.Array
+    done: jax.Array
+    metrics: dict[str, jax.Array]
+    info: dict[str, Any]
