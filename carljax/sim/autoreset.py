@@ -7,17 +7,36 @@ truncated episode bootstraps without a second raster or forward pass. Learners g
 
 from __future__ import annotations
 
+from typing import Protocol
+
 import jax
 import jax.numpy as jnp
 
 from carljax.sim.types import State
 
 
-def step(env, state: State, action: jax.Array, key: jax.Array) -> State:
+class Env(Protocol):
+    """What the rollout asks of an environment: everything unbatched.
+
+    `reset(key)` is `observe(start(key))` and `step(state, action)` is `observe(advance(state, action))`.
+    They are apart so that an autoreset chooses the state first and draws only one image.
+    """
+
+    def start(self, key: jax.Array) -> State:
+        """Returns the first state of an episode, its `obs` still None."""
+
+    def advance(self, state: State, action: jax.Array) -> State:
+        """Returns the next state, its `obs` still None."""
+
+    def observe(self, state: State) -> State:
+        """Returns the state with its `obs` filled in."""
+
+
+def step(env: Env, state: State, action: jax.Array, key: jax.Array) -> State:
     """Steps a running episode, restarts an ended one.
 
     Args:
-      env: a `DrivingEnv` or anything with its `reset` and `step`.
+      env: the environment.
       state: unbatched state; `state.done` decides.
       action: (2,) float32 in [-1, 1].
       key: PRNG key of this step, used by a restart only.
@@ -25,6 +44,7 @@ def step(env, state: State, action: jax.Array, key: jax.Array) -> State:
     Returns:
       The next state.
     """
-    fresh = env.reset(key)
-    stepped = env.step(state, action)
-    return jax.tree.map(lambda a, b: jnp.where(state.done > 0, a, b), fresh, stepped)
+    fresh = env.start(key)
+    stepped = env.advance(state, action)
+    chosen = jax.tree.map(lambda a, b: jnp.where(state.done > 0, a, b), fresh, stepped)
+    return env.observe(chosen)
