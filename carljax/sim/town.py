@@ -1,0 +1,74 @@
+"""A town on the host: what was read from its file and the tables made of it."""
+
+from __future__ import annotations
+
+import dataclasses
+import pathlib
+
+import numpy as np
+
+from carljax.sim import junctions, lane_table, light_table, opendrive
+from carljax.sim.road_network import MapError, RoadNetwork
+
+
+@dataclasses.dataclass(frozen=True)
+class Town:
+    """One town, ready to be put on the device.
+
+    Attributes:
+      network: as read, moved so that its middle lies near (0, 0).
+      offset: (2,) float64, what was subtracted from the file's coordinates, m.
+      lanes, junctions, lights: its tables.
+    """
+
+    network: RoadNetwork
+    offset: np.ndarray
+    lanes: lane_table.LaneTable
+    junctions: junctions.JunctionTable
+    lights: light_table.LightTable
+
+
+def load(path: str | pathlib.Path) -> Town:
+    """Reads an OpenDRIVE file.
+
+    Raises:
+      MapError: in one line, what is wrong with the file and where.
+    """
+    return from_network(opendrive.load(path))
+
+
+def from_network(network: RoadNetwork) -> Town:
+    """Makes the tables of a town.
+
+    Raises:
+      MapError: the town has no driving lane.
+    """
+    if not any(lane.kind == "driving" for lane in network.lanes):
+        raise MapError(f"{network.name}: no driving lane")
+    network, offset = recentre(network)
+    table = lane_table.build(network)
+    return Town(
+        network=network,
+        offset=offset,
+        lanes=table,
+        junctions=junctions.build(network, table),
+        lights=light_table.build(network, table),
+    )
+
+
+def recentre(network: RoadNetwork) -> tuple[RoadNetwork, np.ndarray]:
+    """Moves a town to the origin in float64: float32 resolves only 0.25 m at UTM coordinates."""
+    xy = np.concatenate([lane.xyz[:, :2] for lane in network.lanes if lane.kind == "driving"])
+    offset = np.round((xy.min(axis=0) + xy.max(axis=0)) / 2)
+    shift = np.array([*offset, 0.0])
+    moved = dataclasses.replace(
+        network,
+        lanes=tuple(dataclasses.replace(x, xyz=x.xyz - shift) for x in network.lanes),
+        marks=tuple(
+            dataclasses.replace(x, xy=x.xy - shift[: x.xy.shape[1]]) for x in network.marks
+        ),
+        signals=tuple(dataclasses.replace(x, xyz=x.xyz - shift) for x in network.signals),
+        crosswalks=tuple(x - shift for x in network.crosswalks),
+        stop_lines=tuple(x - shift for x in network.stop_lines),
+    )
+    return moved, offset
