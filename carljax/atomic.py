@@ -1,4 +1,4 @@
-"""Text files that are either whole or not there: written beside their place, then renamed onto it."""
+"""Text files that are whole or not there: written beside their place, then renamed onto it."""
 
 from __future__ import annotations
 

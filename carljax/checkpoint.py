@@ -1,9 +1,10 @@
 """Checkpoints of a run: the whole training state, saved and restored with Orbax.
 
-A checkpoint is a folder `checkpoints/<update>` that appears in one rename, so a run that is cut off never
-leaves half of one. It has two items: `params`, all that evaluation needs, and `learner`, the rest of the
-training state (optimiser, environments, random keys, update count), with which training goes on exactly as
-if it had never stopped. The newest few are kept, and the one with the best score.
+A checkpoint is a folder `checkpoints/<update>` that appears in one rename, so a run that is cut off
+never leaves half of one. It has two items: `params`, all that evaluation needs, and `learner`, the
+rest of the training state (optimiser, environments, random keys, update count), with which
+training goes on exactly as if it had never stopped. The newest few are kept, and the one with the
+best score.
 """
 
 from __future__ import annotations
