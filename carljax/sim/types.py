@@ -16,6 +16,10 @@ KIND_NONE, KIND_VEHICLE, KIND_PEDESTRIAN, KIND_STATIC = 0, 1, 2, 3
 STOP_NONE, STOP_LIGHT, STOP_SIGN, STOP_YIELD = 0, 1, 2, 3
 LIGHT_GREEN, LIGHT_YELLOW, LIGHT_RED = 0, 1, 2
 
+# A stop sign holds on the lane's last metres before its line; to halt is to halt with the box of the
+# ego over that strip. source: ours; CARLA's trigger boxes are as wide as the lane and a few metres long.
+STOP_BOX_LENGTH = 3.0
+
 
 @struct.dataclass
 class EgoState:
@@ -104,6 +108,7 @@ class Situation:
       route_num_points: () int32.
       route_distance: () m, to the nearest of the current and next five route points.
       speed_limit: () m/s in force.
+      stop_s: (Q,) m, arc length of each stop line on the route.
       stop_xy: (Q, 2) m, centre of each stop line on the route.
       stop_yaw: (Q,) rad, direction of travel across it.
       stop_width: (Q,) m, lane width there.
@@ -123,6 +128,7 @@ class Situation:
     route_num_points: jax.Array
     route_distance: jax.Array
     speed_limit: jax.Array
+    stop_s: jax.Array
     stop_xy: jax.Array
     stop_yaw: jax.Array
     stop_width: jax.Array
@@ -152,6 +158,7 @@ class RewardState:
 
     Attributes:
       history: see `History`.
+      route_s: () m, furthest progress along the route that has been paid.
       ttc_ticks: () int32, steps for which the TTC penalty still holds.
       comfort_ticks: (6,) int32, likewise for each comfort metric.
       stopped_s: () s, time the ego has stood still.
@@ -161,6 +168,7 @@ class RewardState:
     """
 
     history: History
+    route_s: jax.Array
     ttc_ticks: jax.Array
     comfort_ticks: jax.Array
     stopped_s: jax.Array
@@ -178,6 +186,7 @@ class RewardTerms:
       soft: {name: () in [0, 1]} factors.
       terminated: {name: () bool} causes that end the episode.
       finished: () bool, the route's end was reached.
+      timeout: () bool, the time limit has passed.
       penalty: () the terminal penalty.
     """
 
@@ -185,6 +194,7 @@ class RewardTerms:
     soft: dict[str, jax.Array]
     terminated: dict[str, jax.Array]
     finished: jax.Array
+    timeout: jax.Array
     penalty: jax.Array
 
 
