@@ -2,16 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
-import chex
 import jax
 import jax.numpy as jnp
-import numpy as np
 from flax import struct
 
-from carljax.sim import atlas, geometry, spawn
-from carljax.sim.town import Town
+from carljax.sim import geometry
 
 # Bits of `RoadMap.layers`.
 LAYER_ROAD, LAYER_SHOULDER, LAYER_MARK_SOLID, LAYER_MARK_BROKEN, LAYER_JUNCTION, LAYER_PARKING = (
@@ -89,104 +84,6 @@ class RoadMap:
 
 
 PIXELS_PER_METRE = 2.0
-
-
-def build(towns: Sequence[Town], seed: int = 0) -> RoadMap:
-    """Puts towns side by side into one lane table and rasterises each once.
-
-    Args:
-      towns: at least one.
-      seed: of the choice of respawn places.
-
-    Returns:
-      The map; lane rows of town m start at `lane_offsets(towns)[m]`.
-    """
-    chex.assert_axis_dimension_gt(np.zeros(len(towns)), 0, 0)
-    lanes = _lane_arrays(towns)
-    atlases = _atlases(towns, seed)
-    return RoadMap(**{name: _on_device(value) for name, value in {**lanes, **atlases}.items()})
-
-
-def lane_offsets(towns: Sequence[Town]) -> np.ndarray:
-    """(M,) first row of each town in the shared lane table."""
-    return np.concatenate([[0], np.cumsum([len(t.lanes.length) for t in towns])[:-1]])
-
-
-def _on_device(value: np.ndarray) -> jax.Array:
-    wanted = {"f": np.float32, "i": np.int32, "b": bool, "u": value.dtype}[value.dtype.kind]
-    return jnp.asarray(value.astype(wanted))
-
-
-def _shift(index: np.ndarray, offset: int) -> np.ndarray:
-    """Moves indices to their place in the shared table; -1 stays what it is."""
-    return np.where(index >= 0, index + offset, index)
-
-
-def _lane_arrays(towns: Sequence[Town]) -> dict[str, np.ndarray]:
-    rows: dict[str, list[np.ndarray]] = {}
-    slots = max(t.junctions.conflict.shape[1] for t in towns)
-    num_lanes = num_points = num_lights = num_junctions = 0
-    for number, town in enumerate(towns):
-        table, cross, light = town.lanes, town.junctions, town.lights
-        # Forks are named by their first lane; lanes without one got negative names of their own.
-        fork = np.where(cross.fork >= 0, cross.fork + num_lanes, cross.fork - num_lanes)
-        arrays = {
-            "lane_start": table.start + num_points,
-            "lane_num_points": table.num_points,
-            "lane_length": table.length,
-            "lane_speed_limit": table.speed_limit,
-            "lane_curve_speed": table.curve_speed,
-            "lane_successors": _shift(table.successors, num_lanes),
-            "lane_in_junction": cross.junction >= 0,
-            "lane_junction": _shift(cross.junction, num_junctions),
-            "lane_slot": cross.slot,
-            "lane_conflict": np.pad(
-                cross.conflict, ((0, 0), (0, slots - cross.conflict.shape[1]))
-            ),
-            "lane_fork": fork,
-            "lane_stop_s": table.stop_s,
-            "lane_stop_kind": table.stop_kind,
-            "lane_light": _shift(light.lane_light, num_lights),
-            "lane_town": np.full(len(table.length), number),
-            "point_xy": table.point_xyz[:, :2],
-            "point_z": table.point_xyz[:, 2],
-            "point_yaw": table.point_yaw,
-            "point_width": table.point_width,
-            "point_lane": table.point_lane + num_lanes,
-            "light_cycle": light.cycle,
-            "light_start": light.start,
-        }
-        for name, value in arrays.items():
-            rows.setdefault(name, []).append(value)
-        num_lanes += len(table.length)
-        num_points += len(table.point_yaw)
-        num_lights += len(light.cycle)
-        num_junctions += int(cross.junction.max(initial=-1)) + 1
-    return {name: np.concatenate(values) for name, values in rows.items()}
-
-
-def _atlases(towns: Sequence[Town], seed: int) -> dict[str, np.ndarray]:
-    """Pixel atlases and respawn tables, all towns padded to the largest."""
-    frames = [atlas.frame(t.network) for t in towns]
-    shape = tuple(max(f[1][axis] for f in frames) for axis in range(2))
-    extent = (shape[1] / PIXELS_PER_METRE, shape[0] / PIXELS_PER_METRE)
-    out: dict[str, list[np.ndarray]] = {
-        name: [] for name in ("layers", "nearest_point", "origin", "spawn_lane", "spawn_s")
-    }
-    num_lanes = num_points = 0
-    for town, (origin, _) in zip(towns, frames, strict=True):
-        rng = np.random.default_rng(seed)
-        table = town.lanes
-        nearest = atlas.nearest_point(table.point_xyz[:, :2], origin, shape)
-        lane, s = spawn.respawn_table(spawn.places(table), origin, extent, rng)
-        out["layers"].append(atlas.layers(town.network, origin, shape))
-        out["nearest_point"].append(_shift(np.asarray(nearest), num_points))
-        out["origin"].append(origin)
-        out["spawn_lane"].append(_shift(lane, num_lanes))
-        out["spawn_s"].append(s)
-        num_lanes += len(table.length)
-        num_points += len(table.point_yaw)
-    return {name: np.stack(values) for name, values in out.items()}
 
 
 @struct.dataclass

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import pathlib
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -26,6 +27,39 @@ class Town:
     lanes: lane_table.LaneTable
     junctions: junctions.JunctionTable
     lights: light_table.LightTable
+
+
+@dataclasses.dataclass(frozen=True)
+class Offsets:
+    """Where a town's rows begin in the tables that all towns share.
+
+    Attributes:
+      town: its index.
+      lane, point, light, junction: first rows.
+    """
+
+    town: int
+    lane: int
+    point: int
+    light: int
+    junction: int
+
+
+def offsets(towns: Sequence[Town]) -> list[Offsets]:
+    """First rows of each town in the shared tables."""
+    out = [Offsets(0, 0, 0, 0, 0)]
+    for town in towns:
+        last = out[-1]
+        out.append(
+            Offsets(
+                town=last.town + 1,
+                lane=last.lane + len(town.lanes.length),
+                point=last.point + len(town.lanes.point_yaw),
+                light=last.light + len(town.lights.cycle),
+                junction=last.junction + int(town.junctions.junction.max(initial=-1)) + 1,
+            )
+        )
+    return out[:-1]
 
 
 def load(path: str | pathlib.Path) -> Town:

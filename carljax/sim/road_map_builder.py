@@ -1,0 +1,97 @@
+"""Towns from the host to the device: one lane table for all, one atlas each."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from carljax.sim import atlas, spawn
+from carljax.sim.road_map import PIXELS_PER_METRE, RoadMap
+from carljax.sim.town import Town, offsets
+
+
+def build(towns: Sequence[Town], seed: int = 0) -> RoadMap:
+    """Puts towns side by side into one lane table and rasterises each once.
+
+    Args:
+      towns: at least one.
+      seed: of the choice of respawn places.
+
+    Returns:
+      The map; `town.offsets(towns)` tells where the rows of each town begin.
+    """
+    lanes = _lane_arrays(towns)
+    atlases = _atlases(towns, seed)
+    return RoadMap(**{name: _on_device(value) for name, value in {**lanes, **atlases}.items()})
+
+
+def _on_device(value: np.ndarray) -> jax.Array:
+    wanted = {"f": np.float32, "i": np.int32, "b": bool, "u": value.dtype}[value.dtype.kind]
+    return jnp.asarray(value.astype(wanted))
+
+
+def _shift(index: np.ndarray, offset: int) -> np.ndarray:
+    """Moves indices to their place in the shared table; -1 stays what it is."""
+    return np.where(index >= 0, index + offset, index)
+
+
+def _lane_arrays(towns: Sequence[Town]) -> dict[str, np.ndarray]:
+    rows: dict[str, list[np.ndarray]] = {}
+    slots = max(t.junctions.conflict.shape[1] for t in towns)
+    for town, first in zip(towns, offsets(towns), strict=True):
+        table, cross, light = town.lanes, town.junctions, town.lights
+        # Forks are named by their first lane; lanes without one got negative names of their own.
+        fork = np.where(cross.fork >= 0, cross.fork + first.lane, cross.fork - first.lane)
+        arrays = {
+            "lane_start": table.start + first.point,
+            "lane_num_points": table.num_points,
+            "lane_length": table.length,
+            "lane_speed_limit": table.speed_limit,
+            "lane_curve_speed": table.curve_speed,
+            "lane_successors": _shift(table.successors, first.lane),
+            "lane_in_junction": cross.junction >= 0,
+            "lane_junction": _shift(cross.junction, first.junction),
+            "lane_slot": cross.slot,
+            "lane_conflict": np.pad(
+                cross.conflict, ((0, 0), (0, slots - cross.conflict.shape[1]))
+            ),
+            "lane_fork": fork,
+            "lane_stop_s": table.stop_s,
+            "lane_stop_kind": table.stop_kind,
+            "lane_light": _shift(light.lane_light, first.light),
+            "lane_town": np.full(len(table.length), first.town),
+            "point_xy": table.point_xyz[:, :2],
+            "point_z": table.point_xyz[:, 2],
+            "point_yaw": table.point_yaw,
+            "point_width": table.point_width,
+            "point_lane": table.point_lane + first.lane,
+            "light_cycle": light.cycle,
+            "light_start": light.start,
+        }
+        for name, value in arrays.items():
+            rows.setdefault(name, []).append(value)
+    return {name: np.concatenate(values) for name, values in rows.items()}
+
+
+def _atlases(towns: Sequence[Town], seed: int) -> dict[str, np.ndarray]:
+    """Pixel atlases and respawn tables, all towns padded to the largest."""
+    frames = [atlas.frame(t.network) for t in towns]
+    shape = tuple(max(f[1][axis] for f in frames) for axis in range(2))
+    extent = (shape[1] / PIXELS_PER_METRE, shape[0] / PIXELS_PER_METRE)
+    out: dict[str, list[np.ndarray]] = {
+        name: [] for name in ("layers", "nearest_point", "origin", "spawn_lane", "spawn_s")
+    }
+    for town, first, (origin, _) in zip(towns, offsets(towns), frames, strict=True):
+        rng = np.random.default_rng(seed)
+        table = town.lanes
+        nearest = atlas.nearest_point(table.point_xyz[:, :2], origin, shape)
+        lane, s = spawn.respawn_table(spawn.places(table), origin, extent, rng)
+        out["layers"].append(atlas.layers(town.network, origin, shape))
+        out["nearest_point"].append(_shift(np.asarray(nearest), first.point))
+        out["origin"].append(origin)
+        out["spawn_lane"].append(_shift(lane, first.lane))
+        out["spawn_s"].append(s)
+    return {name: np.stack(values) for name, values in out.items()}

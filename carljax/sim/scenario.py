@@ -1,0 +1,118 @@
+"""The bank of scenarios: routes and traffic made ahead, drawn from at every reset.
+
+A scenario is a route, the places where traffic stands at its start, and nothing else: light phases,
+sizes and tempers of drivers are drawn at reset, so no two episodes on one scenario are the same.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+
+from carljax.sim import road_map_builder, route_generator, spawn
+from carljax.sim.road_map import RoadMap
+from carljax.sim.route import Route
+from carljax.sim.route_generator import RouteSizes
+from carljax.sim.town import Town, offsets
+
+TRAFFIC_RADIUS = 140.0  # m around the start, where traffic stands at first
+EGO_CLEARANCE = 18.0  # m kept free around the start
+ROUTE_SLACK = 8  # route points beyond one per metre
+
+
+@struct.dataclass
+class ScenarioBank:
+    """All that stays the same while training: held once per device.
+
+    Attributes:
+      road_map: the towns.
+      routes: `Route` with a leading axis S.
+      agent_lane: (S, N) int32, lane row of each agent at the start, -1 for an empty slot.
+      agent_s: (S, N) m along it.
+      agent_speed: (S, N) m/s.
+    """
+
+    road_map: RoadMap
+    routes: Route
+    agent_lane: jax.Array
+    agent_s: jax.Array
+    agent_speed: jax.Array
+
+    @property
+    def num_scenarios(self) -> int:
+        """S."""
+        return self.agent_lane.shape[0]
+
+    @property
+    def num_agents(self) -> int:
+        """N."""
+        return self.agent_lane.shape[1]
+
+
+def make_bank(
+    towns: Sequence[Town], num_scenarios: int, num_agents: int, seed: int,
+    route_length: float = 1000.0,
+) -> ScenarioBank:
+    """Draws scenarios, the same number in every town (as evenly as it goes).
+
+    Args:
+      towns: at least one.
+      num_scenarios: S.
+      num_agents: N, the most agents in a scenario.
+      seed: of everything drawn; other seeds give other routes.
+      route_length: m.
+
+    Returns:
+      The bank.
+
+    Raises:
+      RouteError: a town has no route of that length.
+    """
+    sizes = RouteSizes(num_points=int(route_length) + ROUTE_SLACK)
+    found = [spawn.places(town.lanes) for town in towns]
+    firsts = offsets(towns)
+    routes, agents = [], []
+    for number in range(num_scenarios):
+        town = number % len(towns)
+        rng = np.random.default_rng([seed, number])
+        route = route_generator.draw(towns[town], firsts[town], route_length, sizes, rng)
+        routes.append(route)
+        agents.append(
+            _traffic(towns[town], found[town], firsts[town].lane, route, num_agents, rng)
+        )
+    lane, s, speed = (np.stack(values) for values in zip(*agents, strict=True))
+    return ScenarioBank(
+        road_map=road_map_builder.build(towns),
+        routes=jax.tree.map(lambda *x: jnp.asarray(np.stack(x)), *routes),
+        agent_lane=jnp.asarray(lane, jnp.int32),
+        agent_s=jnp.asarray(s, jnp.float32),
+        agent_speed=jnp.asarray(speed, jnp.float32),
+    )
+
+
+def _traffic(
+    town: Town, found: spawn.Places, first_lane: int, route: Route, num_agents: int,
+    rng: np.random.Generator,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Where traffic stands at the start: lane (N,), s (N,) m, speed (N,) m/s."""
+    away = np.hypot(*(found.xy - route.xy[0]).T)
+    free = np.flatnonzero((away > EGO_CLEARANCE) & (away < TRAFFIC_RADIUS))
+    # From quiet streets to as many cars as there is room for.
+    most = int(rng.integers(num_agents // 4, num_agents + 1))
+    chosen = rng.permutation(free)[:most]
+    lane = np.full(num_agents, -1)
+    s, speed = np.zeros(num_agents), np.zeros(num_agents)
+    lane[: len(chosen)] = found.lane[chosen]
+    s[: len(chosen)] = found.s[chosen]
+    for i in range(len(chosen)):
+        # Slow enough to stop behind the car in front or before the lane's end.
+        ahead = s[(lane == lane[i]) & (s > s[i])]
+        gap = min(ahead.min(initial=np.inf) - 6.0, town.lanes.length[lane[i]] - 3.0) - s[i]
+        limit = min(town.lanes.speed_limit[lane[i]], town.lanes.curve_speed[lane[i]])
+        speed[i] = min(0.9 * limit, np.sqrt(2.0 * 2.0 * max(gap, 0.0)))
+    lane[: len(chosen)] += first_lane
+    return lane, s, speed
