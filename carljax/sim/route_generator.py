@@ -180,6 +180,7 @@ def _assemble(
     step = np.hypot(*np.diff(pose[:, :2], axis=0).T)
     light = town.lights.lane_light
     light = np.where(light >= 0, light + first.light, -1)
+    s = np.concatenate([[0.0], np.cumsum(step)])
     in_junction = np.array([table.junction[row] is not None for row in lane])
 
     def pad(values: np.ndarray, size: int, fill: float | None = None) -> np.ndarray:
@@ -190,14 +191,18 @@ def _assemble(
     return Route(
         xy=pad(pose[:, :2], sizes.num_points).astype(np.float32),
         yaw=pad(pose[:, 2], sizes.num_points).astype(np.float32),
-        s=pad(np.concatenate([[0.0], np.cumsum(step)]), sizes.num_points).astype(np.float32),
+        s=pad(s, sizes.num_points).astype(np.float32),
         lane=pad(lane + first.lane, sizes.num_points).astype(np.int32),
         lane_s=pad(lane_s, sizes.num_points).astype(np.float32),
         speed_limit=pad(_limits(town, lane, signs), sizes.num_points).astype(np.float32),
         in_junction=pad(in_junction, sizes.num_points),
         num_points=np.int32(num),
+        length=np.float32(s[-1]),
         town=np.int32(first.town),
         stop_idx=pad(stops, sizes.num_stops, -1).astype(np.int32),
+        stop_xy=pad(pose[stops, :2], sizes.num_stops, 0.0).astype(np.float32),
+        stop_yaw=pad(pose[stops, 2], sizes.num_stops, 0.0).astype(np.float32),
+        stop_s=pad(s[stops], sizes.num_stops, 0.0).astype(np.float32),
         stop_kind=pad(table.stop_kind[stop_lane], sizes.num_stops, STOP_NONE).astype(np.int32),
         stop_light=pad(light[stop_lane], sizes.num_stops, -1).astype(np.int32),
         stop_width=pad(pose[stops, 3], sizes.num_stops, 0.0).astype(np.float32),

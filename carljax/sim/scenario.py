@@ -14,6 +14,7 @@ import numpy as np
 from flax import struct
 
 from carljax.sim import road_map_builder, route_generator, spawn
+from carljax.sim import route as route_module
 from carljax.sim.road_map import RoadMap
 from carljax.sim.route import Route
 from carljax.sim.route_generator import RouteSizes
@@ -72,7 +73,7 @@ def make_bank(
     Raises:
       RouteError: a town has no route of that length.
     """
-    sizes = RouteSizes(num_points=int(route_length) + ROUTE_SLACK)
+    sizes = RouteSizes(num_points=max(int(route_length) + ROUTE_SLACK, route_module.WINDOW))
     found = [spawn.places(town.lanes) for town in towns]
     firsts = offsets(towns)
     routes, agents = [], []

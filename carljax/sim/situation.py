@@ -1,0 +1,113 @@
+"""What the ego's surroundings are after a step, looked up once for reward and observation."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+
+from carljax.sim import geometry, lights, route
+from carljax.sim.road_map import (
+    LAYER_PARKING,
+    LAYER_ROAD,
+    LAYER_SHOULDER,
+    RoadMap,
+    layer_bits,
+    nearest_lane,
+)
+from carljax.sim.route import Route
+from carljax.sim.traffic import EgoPlace
+from carljax.sim.types import LIGHT_GREEN, STOP_LIGHT, EgoState, Situation
+
+# Sample points along and across the ego's footprint, 0.6 m apart: the atlas resolves 0.5 m.
+FOOTPRINT = (9, 4)
+ON_ROUTE = 2.0  # m from the route within which the ego counts as on the route's own lane
+JUNCTION_LOOK_AHEAD = 18  # route points ahead at which the ego is seen to be about to enter a lane
+
+
+def situation(
+    ego: EgoState,
+    ego_size: tuple[float, float],
+    road_map: RoadMap,
+    stretch: Route,
+    stretch_start: jax.Array,
+    stretch_idx: jax.Array,
+    light_time: jax.Array,
+) -> Situation:
+    """Looks up road and route.
+
+    Args:
+      ego: the ego.
+      ego_size: its length and width, m.
+      road_map: the map.
+      stretch: window of the route around the ego.
+      stretch_start: () int32, the window's first route index.
+      stretch_idx: () int32, last passed point, counted from the window's start.
+      light_time: () s.
+
+    Returns:
+      The situation; its route index counts from the route's start.
+    """
+    lane = nearest_lane(road_map, stretch.town, ego.xy)
+    centre = layer_bits(road_map, stretch.town, ego.xy)
+    return Situation(
+        lane_lateral=lane.lateral,
+        lane_yaw=lane.yaw,
+        lane_width=lane.width,
+        lane_in_junction=lane.in_junction,
+        on_parking=(centre & LAYER_PARKING) > 0,
+        off_road_frac=off_road_frac(ego, ego_size, road_map, stretch.town),
+        route_idx=stretch_idx + stretch_start,
+        route_s=stretch.s[stretch_idx],
+        route_length=stretch.length,
+        route_num_points=stretch.num_points + stretch_start,
+        route_distance=route.distance(stretch, stretch_idx, ego.xy),
+        speed_limit=stretch.speed_limit[stretch_idx],
+        stop_s=stretch.stop_s,
+        stop_xy=stretch.stop_xy,
+        stop_yaw=stretch.stop_yaw,
+        stop_width=stretch.stop_width,
+        stop_kind=stretch.stop_kind,
+        stop_light=stop_lights(road_map, stretch, light_time),
+    )
+
+
+def stop_lights(road_map: RoadMap, stretch: Route, light_time: jax.Array) -> jax.Array:
+    """(Q,) int32 LIGHT_* of each stop line of the route; LIGHT_GREEN where there is no light."""
+    light = jnp.maximum(stretch.stop_light, 0)
+    colour = lights.state(light_time, road_map.light_start[light], road_map.light_cycle[light])
+    governed = (stretch.stop_kind == STOP_LIGHT) & (stretch.stop_light >= 0)
+    return jnp.where(governed, colour, LIGHT_GREEN)
+
+
+def yellow_left(road_map: RoadMap, stretch: Route, light_time: jax.Array) -> jax.Array:
+    """(Q,) s of yellow that remain at each stop line's light."""
+    light = jnp.maximum(stretch.stop_light, 0)
+    return lights.yellow_left(light_time, road_map.light_start[light], road_map.light_cycle[light])
+
+
+def off_road_frac(
+    ego: EgoState, ego_size: tuple[float, float], road_map: RoadMap, town: jax.Array
+) -> jax.Array:
+    """() fraction of the ego's footprint that is on neither road, parking lane nor shoulder."""
+    along = jnp.linspace(-0.5, 0.5, FOOTPRINT[0], dtype=jnp.float32) * ego_size[0]
+    across = jnp.linspace(-0.5, 0.5, FOOTPRINT[1], dtype=jnp.float32) * ego_size[1]
+    grid = jnp.stack(jnp.meshgrid(along, across), axis=-1).reshape(-1, 2)
+    bits = layer_bits(road_map, town, geometry.from_frame(grid, ego.xy, ego.yaw))
+    drivable = (bits & (LAYER_ROAD | LAYER_PARKING | LAYER_SHOULDER)) > 0
+    return 1.0 - drivable.mean(dtype=jnp.float32)
+
+
+def ego_place(
+    ego: EgoState, road_map: RoadMap, stretch: Route, stretch_idx: jax.Array
+) -> EgoPlace:
+    """Where traffic takes the ego to be: on its route's lane when it is near, else on the nearest lane."""
+    nearest = nearest_lane(road_map, stretch.town, ego.xy)
+    on_route = route.distance(stretch, stretch_idx, ego.xy) < ON_ROUTE
+    offset = geometry.to_frame(ego.xy, stretch.xy[stretch_idx], stretch.yaw[stretch_idx])
+    lane = jnp.where(on_route, stretch.lane[stretch_idx], nearest.lane)
+    s = jnp.where(on_route, stretch.lane_s[stretch_idx] + offset[0], nearest.s)
+    ahead = jnp.minimum(stretch_idx + JUNCTION_LOOK_AHEAD, stretch.num_points - 1)
+    coming = stretch.lane[ahead]
+    return EgoPlace(
+        lane=lane, next_lane=jnp.where(on_route & (coming != lane), coming, -1), s=s
+    )
