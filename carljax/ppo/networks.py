@@ -1,0 +1,179 @@
+"""The actor-critic: image encoder, scalar branch, joint trunk, Beta policy head, asymmetric critic.
+
+Source: CaRL paper, "Architecture", after Roach (Zhang et al. 2021). Every layer is linear or
+convolution, then LayerNorm, then ReLU; the LayerNorm of a convolution spans height, width and channels
+together and has an affine weight for each. The critic alone sees the value scalars.
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+from flax import linen as nn
+
+from carljax.ppo.config import NetworkConfig
+from carljax.ppo.conv import conv, patches, tall_matmul
+from carljax.sim.types import Observation
+
+# Channels, kernel, stride of each convolution. source: CaRL paper, "Architecture" (and Roach's).
+CONV_LAYERS = {
+    "carl": ((8, 5, 2), (16, 5, 2), (24, 5, 2), (32, 5, 2), (64, 3, 2), (128, 3, 1), (256, 3, 1)),
+    "roach": ((8, 5, 2), (16, 5, 2), (32, 5, 2), (64, 3, 2), (128, 3, 2), (256, 3, 1)),
+}
+CONV_BIAS = 0.1  # source: Roach's initialisation, kept by CaRL
+NORM_EPS = 1e-5  # source: PyTorch's default, which the paper's trainer used
+_MIN_SIZE = 2  # height and width of the paper's last feature map
+
+_conv_init = nn.initializers.variance_scaling(2.0, "fan_avg", "uniform")  # Xavier, ReLU gain
+
+
+class ActorCritic(nn.Module):
+    """The whole network.
+
+    Attributes:
+      config: sizes and encoder.
+      action_size: dimensions of the action.
+    """
+
+    config: NetworkConfig
+    action_size: int = 2
+
+    @nn.compact
+    def __call__(self, obs: Observation) -> tuple[jax.Array, jax.Array, jax.Array]:
+        """Returns policy and value.
+
+        Args:
+          obs: (N,) observations; raster uint8, scalars as they are.
+
+        Returns:
+          (N, A) alpha, (N, A) beta, (N,) value, all float32.
+        """
+        config = self.config
+        image = _encoder(config)(obs.raster)
+        scalars = Mlp(config, (config.hidden_size, config.hidden_size), name="scalar_mlp")(
+            obs.scalars
+        )
+        joint = jnp.concatenate([image, scalars], axis=-1)
+        features = Mlp(config, (config.joint_size, config.hidden_size), name="joint_mlp")(joint)
+        head = (config.hidden_size, config.hidden_size)
+        policy = Mlp(config, head, name="policy_mlp")(features)
+        alpha = nn.softplus(Linear(self.action_size, name="alpha")(policy)) + config.beta_min
+        beta = nn.softplus(Linear(self.action_size, name="beta")(policy)) + config.beta_min
+        critic_input = jnp.concatenate([features, obs.value_scalars], axis=-1)
+        critic = Mlp(config, head, name="value_mlp")(critic_input)
+        return alpha, beta, Linear(1, name="value")(critic)[..., 0]
+
+
+class Linear(nn.Module):
+    """A linear layer with PyTorch's default initialisation, uniform in +-1 / sqrt(inputs)."""
+
+    features: int
+
+    @nn.compact
+    def __call__(self, x: jax.Array) -> jax.Array:
+        """Maps (N, I) to (N, features)."""
+        bound = x.shape[-1] ** -0.5
+
+        def init(key: jax.Array, shape: tuple[int, ...]) -> jax.Array:
+            return jax.random.uniform(key, shape, minval=-bound, maxval=bound)
+
+        kernel = self.param("kernel", init, (x.shape[-1], self.features))
+        return x @ kernel + self.param("bias", init, (self.features,))
+
+
+class Mlp(nn.Module):
+    """Linear layers, each followed by LayerNorm and ReLU."""
+
+    config: NetworkConfig
+    sizes: tuple[int, ...]
+
+    @nn.compact
+    def __call__(self, x: jax.Array) -> jax.Array:
+        """Maps (N, I) to (N, sizes[-1])."""
+        for size in self.sizes:
+            x = Linear(size)(x)
+            if self.config.layer_norm:
+                x = nn.LayerNorm(epsilon=NORM_EPS)(x)
+            x = nn.relu(x)
+        return x
+
+
+class ConvEncoder(nn.Module):
+    """The paper's convolutions, for an image of any size.
+
+    At 256 px (carl) and 192 px (roach) this is the paper's network. A smaller image would vanish on the
+    way: a layer whose output would have less than 2 rows or columns is padded as "SAME" at its stride,
+    and if that is still too small its stride becomes 1. So 64 and 128 px end in 2 x 2 x 256 features
+    too.
+    """
+
+    config: NetworkConfig
+
+    @nn.compact
+    def __call__(self, raster: jax.Array) -> jax.Array:
+        """Maps (N, H, W, C) uint8 to (N, features) float32."""
+        x = raster.astype(jnp.float32) * jnp.float32(1.0 / 255.0)
+        for i, (features, kernel, stride) in enumerate(CONV_LAYERS[self.config.encoder]):
+            shape = (kernel, kernel, x.shape[-1], features)
+            weight = self.param(f"kernel_{i}", _conv_init, shape)
+            bias = self.param(f"bias_{i}", nn.initializers.constant(CONV_BIAS), (features,))
+            padding, stride = conv_fit(x.shape[1:3], kernel, stride)
+            x = conv(jnp.pad(x, ((0, 0), *padding, (0, 0))), weight, stride) + bias
+            if self.config.layer_norm:
+                axes = (-3, -2, -1)
+                x = nn.LayerNorm(epsilon=NORM_EPS, reduction_axes=axes, feature_axes=axes)(x)
+            x = nn.relu(x)
+        return x.reshape(x.shape[0], -1)
+
+
+def conv_fit(
+    size: tuple[int, ...], kernel: int, stride: int
+) -> tuple[list[tuple[int, int]], int]:
+    """Chooses padding and stride of a layer by the rule of `ConvEncoder`.
+
+    Args:
+      size: height and width of the layer's input.
+      kernel: side of its kernel.
+      stride: the paper's stride.
+
+    Returns:
+      Padding before and after each axis, and the stride to use.
+    """
+    if (min(size) - kernel) // stride + 1 >= _MIN_SIZE:
+        return [(0, 0), (0, 0)], stride
+    if -(-min(size) // stride) < _MIN_SIZE:
+        stride = 1
+    totals = [max((-(-n // stride) - 1) * stride + kernel - n, 0) for n in size]
+    return [(total // 2, total - total // 2) for total in totals], stride
+
+
+class PatchEncoder(nn.Module):
+    """Convolutions whose stride is their kernel: a reshape and a matrix product, fast on a CPU.
+
+    Patches of the image, then 2 x 2 of those; edges are padded with zeros to whole patches.
+    """
+
+    config: NetworkConfig
+
+    @nn.compact
+    def __call__(self, raster: jax.Array) -> jax.Array:
+        """Maps (N, H, W, C) uint8 to (N, features) float32."""
+        x = raster.astype(jnp.float32) * jnp.float32(1.0 / 255.0)
+        sizes = (self.config.patch_size, 2)
+        for i, (size, features) in enumerate(zip(sizes, self.config.patch_features, strict=True)):
+            padding = [(0, -n % size) for n in x.shape[1:3]]
+            x = patches(jnp.pad(x, ((0, 0), *padding, (0, 0))), size)
+            weight = self.param(f"kernel_{i}", _conv_init, (x.shape[-1], features))
+            bias = self.param(f"bias_{i}", nn.initializers.constant(CONV_BIAS), (features,))
+            product = tall_matmul(x.reshape(-1, x.shape[-1]), weight)
+            x = product.reshape(*x.shape[:-1], features) + bias
+            if self.config.layer_norm:
+                x = nn.LayerNorm(epsilon=NORM_EPS)(x)
+            x = nn.relu(x)
+        return x.reshape(x.shape[0], -1)
+
+
+def _encoder(config: NetworkConfig) -> nn.Module:
+    if config.encoder == "patch":
+        return PatchEncoder(config, name="encoder")
+    return ConvEncoder(config, name="encoder")
