@@ -76,7 +76,8 @@ def box_corners(xy: jax.Array, yaw: jax.Array, length: jax.Array, width: jax.Arr
     Args:
       xy: (..., 2) m, box centre.
       yaw: (...) rad, direction of its length.
-      length, width: (...) m.
+      length: (...) m.
+      width: (...) m.
 
     Returns:
       (..., 4, 2) m: front left, rear left, rear right, front right.
@@ -105,22 +106,29 @@ def boxes_overlap(
     All arguments broadcast, so one ego (no leading axis) goes against (N,) others.
 
     Args:
-      xy_a, xy_b: (..., 2) m, box centres.
-      yaw_a, yaw_b: (...) rad.
-      length_a, width_a, length_b, width_b: (...) m.
+      xy_a: (..., 2) m, box centre.
+      yaw_a: (...) rad.
+      length_a: (...) m.
+      width_a: (...) m.
+      xy_b: (..., 2) m, box centre.
+      yaw_b: (...) rad.
+      length_b: (...) m.
+      width_b: (...) m.
 
     Returns:
       (...) bool.
     """
-    turn = yaw_b - yaw_a
-    cos, sin = jnp.abs(jnp.cos(turn)), jnp.abs(jnp.sin(turn))
-    offset = xy_b - xy_a
-    in_a = jnp.abs(rotate(offset, -yaw_a))
-    in_b = jnp.abs(rotate(offset, -yaw_b))
-    overlap_a = (2.0 * in_a[..., 0] < length_a + length_b * cos + width_b * sin) & (
-        2.0 * in_a[..., 1] < width_a + length_b * sin + width_b * cos
+    cos_a, sin_a = jnp.cos(yaw_a), jnp.sin(yaw_a)
+    cos_b, sin_b = jnp.cos(yaw_b), jnp.sin(yaw_b)
+    # Cosine and sine of the turn from a to b without two more calls: trigonometry is the cost here.
+    cos = jnp.abs(cos_a * cos_b + sin_a * sin_b)
+    sin = jnp.abs(cos_a * sin_b - sin_a * cos_b)
+    dx, dy = xy_b[..., 0] - xy_a[..., 0], xy_b[..., 1] - xy_a[..., 1]
+    along_a, left_a = jnp.abs(cos_a * dx + sin_a * dy), jnp.abs(cos_a * dy - sin_a * dx)
+    along_b, left_b = jnp.abs(cos_b * dx + sin_b * dy), jnp.abs(cos_b * dy - sin_b * dx)
+    return (
+        (2.0 * along_a < length_a + length_b * cos + width_b * sin)
+        & (2.0 * left_a < width_a + length_b * sin + width_b * cos)
+        & (2.0 * along_b < length_b + length_a * cos + width_a * sin)
+        & (2.0 * left_b < width_b + length_a * sin + width_a * cos)
     )
-    overlap_b = (2.0 * in_b[..., 0] < length_b + length_a * cos + width_a * sin) & (
-        2.0 * in_b[..., 1] < width_b + length_a * sin + width_a * cos
-    )
-    return overlap_a & overlap_b
