@@ -1,0 +1,227 @@
+"""The one XLA program: rollout, advantages and update of all devices as one jitted function.
+
+Environments are shared out over the mesh axis "data"; parameters, optimiser state and the environment's
+constant arrays are on every device. A mesh of one device runs the same code.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+
+from carljax.ppo.config import PPOConfig
+from carljax.ppo.gae import gae
+from carljax.ppo.networks import ActorCritic
+from carljax.ppo.rollout import mean_metrics, rollout
+from carljax.ppo.types import Minibatch, TrainState, Transition
+from carljax.ppo.update import (
+    AXIS,
+    explained_variance,
+    flatten,
+    learning_rate,
+    make_optimizer,
+    update,
+)
+from carljax.sim.autoreset import Env
+
+_SPEC = TrainState(
+    params=PartitionSpec(),
+    opt_state=PartitionSpec(),
+    env_state=PartitionSpec(AXIS),
+    key=PartitionSpec(),
+    update=PartitionSpec(),
+)
+
+TrainStep = Callable[[Env, TrainState], tuple[TrainState, dict[str, jax.Array]]]
+
+
+def make_mesh(num_devices: int | None = None) -> Mesh:
+    """Returns a mesh of the first devices (all by default) with the one axis "data"."""
+    devices = jax.devices()
+    if num_devices is not None and not 1 <= num_devices <= len(devices):
+        raise ValueError(f"{num_devices} devices were asked for, but there are {len(devices)}")
+    return Mesh(np.array(devices[:num_devices]), (AXIS,))
+
+
+def shardings(mesh: Mesh) -> TrainState:
+    """Returns the sharding of each part of a `TrainState`, a prefix tree for `jax.device_put`."""
+    return jax.tree.map(
+        lambda spec: NamedSharding(mesh, spec),
+        _SPEC,
+        is_leaf=lambda x: isinstance(x, PartitionSpec),
+    )
+
+
+def replicate(tree: Any, mesh: Mesh) -> Any:
+    """Copies arrays to every device, once; else each call of the train step would do it."""
+    return jax.device_put(tree, NamedSharding(mesh, PartitionSpec()))
+
+
+def init(
+    key: jax.Array, env: Env, network: ActorCritic, config: PPOConfig, mesh: Mesh
+) -> TrainState:
+    """Makes the first training state, each part where the train step wants it.
+
+    Args:
+      key: PRNG key of the run.
+      env: unbatched environment, a pytree (see `replicate`).
+      network: actor and critic.
+      config: see `PPOConfig`.
+      mesh: see `make_mesh`.
+
+    Returns:
+      The state before the first update.
+
+    Raises:
+      ValueError: sizes that don't divide evenly.
+    """
+    config.validate(mesh.size)
+
+    def build(key: jax.Array, env: Env) -> TrainState:
+        key_params, key_env, key_run = jax.random.split(key, 3)
+        keys = _env_keys(key_env, jnp.arange(config.num_envs))
+        env_state = jax.vmap(lambda key: env.observe(env.start(key)))(keys)
+        params = network.init(key_params, jax.tree.map(lambda x: x[:1], env_state.obs))
+        return TrainState(
+            params=params,
+            opt_state=make_optimizer(config).init(params),
+            env_state=env_state,
+            key=key_run,
+            update=jnp.zeros((), jnp.int32),
+        )
+
+    return jax.jit(build, out_shardings=shardings(mesh))(key, env)
+
+
+def make_train_step(network: ActorCritic, config: PPOConfig, mesh: Mesh) -> TrainStep:
+    """Compiles one PPO iteration: rollout, advantages, epochs x minibatches.
+
+    Args:
+      network: actor and critic.
+      config: see `PPOConfig`.
+      mesh: see `make_mesh`.
+
+    Returns:
+      train_step(env, train_state) -> (train_state, {name: () float32}). It consumes (donates) its
+      train_state. Metrics are means over the rollout of the environment's own (see
+      `rollout.mean_metrics`) and `ppo/...`.
+
+    Raises:
+      ValueError: sizes that don't divide evenly.
+    """
+    config.validate(mesh.size)
+    local = functools.partial(_local_step, network=network, config=config)
+    # Without check_vma a simulator may start its inner loops from constants, which vary over no device.
+    # Nothing here rests on it: no collective is differentiated, and a test compares 1 and 4 devices.
+    sharded = jax.shard_map(
+        local,
+        mesh=mesh,
+        in_specs=(PartitionSpec(), _SPEC),
+        out_specs=(_SPEC, PartitionSpec()),
+        check_vma=False,
+    )
+    options = compiler_options(mesh.devices.flat[0].platform)
+    return jax.jit(sharded, donate_argnums=1, compiler_options=options)
+
+
+def _local_step(
+    env: Env, train_state: TrainState, network: ActorCritic, config: PPOConfig
+) -> tuple[TrainState, dict[str, jax.Array]]:
+    """One PPO iteration on this device's environments."""
+    device = jax.lax.axis_index(AXIS)
+    num_envs = train_state.env_state.done.shape[0]
+    key_rollout, key_shuffle = jax.random.split(
+        jax.random.fold_in(train_state.key, train_state.update)
+    )
+    env_keys = _env_keys(key_rollout, device * num_envs + jnp.arange(num_envs))
+    env_state, batch, last_value, metric_sums = rollout(
+        env, network, train_state.params, train_state.env_state, env_keys, config.num_steps
+    )
+    samples = make_samples(batch, last_value, config)
+    rate = learning_rate(train_state.update, config)
+    params, opt_state, losses = update(
+        train_state.params,
+        train_state.opt_state,
+        samples,
+        jax.random.fold_in(key_shuffle, device),
+        rate,
+        network,
+        config,
+    )
+    metrics = {f"ppo/{name}": value for name, value in losses.items()}
+    metrics["ppo/explained_variance"] = explained_variance(samples)
+    metrics["ppo/learning_rate"] = rate
+    metrics |= _rollout_metrics(metric_sums, batch)
+    train_state = train_state.replace(
+        params=params, opt_state=opt_state, env_state=env_state, update=train_state.update + 1
+    )
+    return train_state, metrics
+
+
+def make_samples(batch: Transition, last_value: jax.Array, config: PPOConfig) -> Minibatch:
+    """Adds advantages and returns to a rollout and flattens it.
+
+    Args:
+      batch: (T, B) transitions.
+      last_value: (B,) value of the states after the last step.
+      config: discount, lambda and what a truncation is worth.
+
+    Returns:
+      (T * B,) samples.
+    """
+    terminated = batch.done
+    if config.bootstrap_truncated:
+        terminated = batch.done * (1.0 - batch.truncation)
+    advantage = gae(
+        batch.reward,
+        batch.value,
+        last_value,
+        terminated,
+        batch.weight,
+        config.gamma,
+        config.gae_lambda,
+    )
+    return flatten(batch, advantage)
+
+
+def _rollout_metrics(sums: dict[str, jax.Array], batch: Transition) -> dict[str, jax.Array]:
+    sums = {**sums, "rollout/reward": jnp.sum(batch.reward), "rollout/value": jnp.sum(
+        batch.value * batch.weight
+    )}
+    counts = (jnp.sum(batch.weight), jnp.sum(batch.done))
+    sums, counts = jax.lax.psum((sums, counts), AXIS)
+    return mean_metrics(sums, *counts)
+
+
+def _env_keys(key: jax.Array, indices: jax.Array) -> jax.Array:
+    """Returns one key per environment, from its index among those of all devices."""
+    return jax.vmap(lambda i: jax.random.fold_in(key, i))(indices)
+
+
+def compiler_options(platform: str) -> dict[str, Any] | None:
+    """Returns XLA options for the train step: on a CPU none of the fusions that run on one thread.
+
+    jaxlib 0.10 hands some convolutions and products to YNNPACK, on one thread and up to four times
+    slower. A jaxlib that doesn't know the option has no such fusion.
+    """
+    options = {"xla_cpu_experimental_ynn_fusion_type": ""}
+    if platform != "cpu":
+        return None
+    return options if _is_known(tuple(options.items())) else None
+
+
+@functools.cache
+def _is_known(options: Sequence[tuple[str, Any]]) -> bool:
+    with jax.default_device(jax.devices("cpu")[0]):
+        probe = jax.jit(lambda x: x, compiler_options=dict(options))
+        try:
+            probe(np.float32(0.0))
+        except jax.errors.JaxRuntimeError:
+            return False
+    return True

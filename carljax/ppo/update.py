@@ -1,0 +1,170 @@
+"""One PPO update: epochs x minibatches as two scans, inside `shard_map` over the axis "data".
+
+Each device shuffles its own share of the batch; statistics, gradients and metrics are those of the
+minibatch of all devices together. Gradients are those of a device's own samples, added up once per
+minibatch by an explicit `psum` outside of what is differentiated. That needs `shard_map` without
+`check_vma` (see `trainer.make_train_step`): with it, gradients of replicated parameters come out summed
+already, once per micro-batch, and the `psum` would count them again.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import optax
+
+from carljax.ppo.config import PPOConfig
+from carljax.ppo.loss import loss
+from carljax.ppo.networks import ActorCritic
+from carljax.ppo.types import Minibatch, Transition
+
+AXIS = "data"
+
+
+def make_optimizer(config: PPOConfig) -> optax.GradientTransformation:
+    """Builds gradient clipping and Adam; the learning rate is applied by `update`."""
+    clip = optax.clip_by_global_norm(config.max_grad_norm)
+    return optax.chain(clip, optax.scale_by_adam(eps=config.adam_eps))
+
+
+def learning_rate(update: jax.Array, config: PPOConfig) -> jax.Array:
+    """Returns () lr (1 - u / N) for update u, or lr."""
+    rate = jnp.float32(config.learning_rate)
+    if not config.anneal_lr:
+        return rate
+    return rate * jnp.maximum(1.0 - update.astype(jnp.float32) / config.num_updates, 0.0)
+
+
+def flatten(batch: Transition, advantage: jax.Array) -> Minibatch:
+    """Joins time and environments to one axis of samples; the weights stay 0 or 1."""
+    samples = Minibatch(
+        obs=batch.obs,
+        action=batch.action,
+        log_prob=batch.log_prob,
+        value=batch.value,
+        advantage=advantage,
+        target=advantage + batch.value,
+        weight=batch.weight,
+    )
+    return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), samples)
+
+
+def update(
+    params: Any,
+    opt_state: Any,
+    samples: Minibatch,
+    key: jax.Array,
+    rate: jax.Array,
+    network: ActorCritic,
+    config: PPOConfig,
+) -> tuple[Any, Any, dict[str, jax.Array]]:
+    """Runs all epochs on one batch.
+
+    Args:
+      params: variables of the network, the same on every device.
+      opt_state: likewise.
+      samples: (N,) this device's samples, from `flatten`.
+      key: PRNG key of this device's shuffles.
+      rate: () learning rate.
+      network: actor and critic.
+      config: see `PPOConfig`.
+
+    Returns:
+      Parameters, optimiser state and {name: ()} means over all gradient steps of the loss's metrics
+      and of grad_norm (before clipping).
+    """
+    optimizer = make_optimizer(config)
+    num_samples = samples.weight.shape[0]
+
+    def gradient_step(carry: tuple, rows: jax.Array) -> tuple[tuple, dict[str, jax.Array]]:
+        params, opt_state = carry
+        grads, metrics = minibatch_gradient(params, samples, rows, network, config)
+        metrics["grad_norm"] = optax.global_norm(grads)
+        direction, opt_state = optimizer.update(grads, opt_state)
+        params = jax.tree.map(lambda p, d: p - rate * d, params, direction)
+        return (params, opt_state), metrics
+
+    def epoch(carry: tuple, key: jax.Array) -> tuple[tuple, dict[str, jax.Array]]:
+        rows = jax.random.permutation(key, num_samples).reshape(config.num_minibatches, -1)
+        return jax.lax.scan(gradient_step, carry, rows)
+
+    keys = jax.random.split(key, config.update_epochs)
+    (params, opt_state), metrics = jax.lax.scan(epoch, (params, opt_state), keys)
+    return params, opt_state, jax.tree.map(jnp.mean, metrics)
+
+
+def minibatch_gradient(
+    params: Any, samples: Minibatch, rows: jax.Array, network: ActorCritic, config: PPOConfig
+) -> tuple[Any, dict[str, jax.Array]]:
+    """Computes the gradient of the loss over one minibatch of all devices.
+
+    Args:
+      params: variables of the network.
+      samples: (N,) this device's samples.
+      rows: (M,) int32, those of them that are in the minibatch.
+      network: actor and critic.
+      config: see `PPOConfig`.
+
+    Returns:
+      Gradient and {name: ()} metrics, the same on every device.
+    """
+    weight = samples.weight[rows]
+    advantage = samples.advantage[rows]
+    if config.norm_adv:
+        advantage = normalise(advantage, weight)
+    weight = weight / jnp.maximum(jax.lax.psum(jnp.sum(weight), AXIS), 1.0)
+
+    def piece(rows: jax.Array, weight: jax.Array, advantage: jax.Array) -> tuple[Any, dict]:
+        # Rows of the large images are gathered here, a cache-sized piece at a time.
+        minibatch = jax.tree.map(lambda x: x[rows], samples)
+        minibatch = minibatch.replace(weight=weight, advantage=advantage)
+        return jax.grad(loss, has_aux=True)(params, network, minibatch, config)
+
+    if config.micro_batch_size is None:
+        total = piece(rows, weight, advantage)
+    else:
+        pieces = [x.reshape(-1, config.micro_batch_size) for x in (rows, weight, advantage)]
+        total = _sum_over(piece, pieces)
+    return jax.lax.psum(total, AXIS)
+
+
+def _sum_over(function: Any, pieces: list[jax.Array]) -> Any:
+    """Adds up function(*piece) over the leading axis."""
+
+    def add(total: Any, piece: list[jax.Array]) -> tuple[Any, None]:
+        return jax.tree.map(jnp.add, total, function(*piece)), None
+
+    first = function(*[x[0] for x in pieces])
+    return jax.lax.scan(add, first, [x[1:] for x in pieces])[0]
+
+
+def normalise(advantage: jax.Array, weight: jax.Array) -> jax.Array:
+    """Shifts and scales advantages to mean 0 and (Bessel-corrected) deviation 1 over all devices.
+
+    Args:
+      advantage: (M,) float32.
+      weight: (M,) float32, 0 for samples that don't count.
+
+    Returns:
+      (M,) float32.
+    """
+    count = jax.lax.psum(jnp.sum(weight), AXIS)
+    mean = jax.lax.psum(jnp.sum(weight * advantage), AXIS) / jnp.maximum(count, 1.0)
+    squares = jax.lax.psum(jnp.sum(weight * jnp.square(advantage - mean)), AXIS)
+    deviation = jnp.sqrt(squares / jnp.maximum(count - 1.0, 1.0))
+    return (advantage - mean) / (deviation + 1e-8)  # source: CaRL's trainer
+
+
+def explained_variance(samples: Minibatch) -> jax.Array:
+    """Returns () 1 - Var(target - value) / Var(target) over all devices; 0 if the target is constant."""
+    weight = samples.weight / jnp.maximum(jax.lax.psum(jnp.sum(samples.weight), AXIS), 1.0)
+
+    def variance(x: jax.Array) -> jax.Array:
+        mean = jax.lax.psum(jnp.sum(weight * x), AXIS)
+        return jax.lax.psum(jnp.sum(weight * jnp.square(x - mean)), AXIS)
+
+    total = variance(samples.target)
+    explained = 1.0 - variance(samples.target - samples.value) / jnp.maximum(total, 1e-12)
+    return jnp.where(total > 1e-12, explained, jnp.float32(0.0))
