@@ -1,0 +1,1 @@
+"""The CaRL reward: one file for each term, composed in `reward`."""

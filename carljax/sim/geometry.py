@@ -10,6 +10,7 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
 
 TWO_PI = np.float32(2.0 * np.pi)
 PI = np.float32(np.pi)
@@ -70,7 +71,7 @@ def from_frame(xy: jax.Array, origin_xy: jax.Array, origin_yaw: jax.Array) -> ja
     return rotate(xy, origin_yaw) + origin_xy
 
 
-def box_corners(xy: jax.Array, yaw: jax.Array, length: jax.Array, width: jax.Array) -> jax.Array:
+def box_corners(xy: jax.Array, yaw: jax.Array, length: ArrayLike, width: ArrayLike) -> jax.Array:
     """Corners of an oriented box, counter-clockwise from its front left.
 
     Args:
@@ -92,12 +93,12 @@ def box_corners(xy: jax.Array, yaw: jax.Array, length: jax.Array, width: jax.Arr
 def boxes_overlap(
     xy_a: jax.Array,
     yaw_a: jax.Array,
-    length_a: jax.Array,
-    width_a: jax.Array,
+    length_a: ArrayLike,
+    width_a: ArrayLike,
     xy_b: jax.Array,
     yaw_b: jax.Array,
-    length_b: jax.Array,
-    width_b: jax.Array,
+    length_b: ArrayLike,
+    width_b: ArrayLike,
 ) -> jax.Array:
     """Whether oriented boxes share area; boxes that only touch do not.
 

@@ -1,0 +1,22 @@
+"""Timers that keep a soft penalty up for a number of steps after its violation."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+
+
+def tick(left: jax.Array, violated: jax.Array, duration: jax.Array | int) -> jax.Array:
+    """Counts down, then starts anew on a violation; the penalty holds while the result is above 0.
+
+    So one violation holds for exactly `duration` steps, the present one included.
+
+    Args:
+      left: int32, steps left after the step before.
+      violated: bool of the same shape.
+      duration: steps.
+
+    Returns:
+      int32 of the same shape.
+    """
+    return jnp.where(violated, duration, jnp.maximum(left - 1, 0))
