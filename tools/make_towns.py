@@ -8,9 +8,9 @@ from __future__ import annotations
 import pathlib
 import sys
 
-from towns import grid, writer
+from towns import grid, highway, village, writer
 
-BUILDERS = {"grid": grid.build}
+BUILDERS = {"grid": grid.build, "village": village.build, "highway": highway.build}
 TARGET = pathlib.Path(__file__).resolve().parent.parent / "carljax" / "sim" / "towns"
 
 

@@ -51,6 +51,7 @@ def connect(
     arms: tuple[Arm, Arm],
     fit: Callable[[Pose, Pose], Path] = geometry.turn,
     outside: bool = False,
+    edge: tuple[float, float] | None = None,
 ) -> Road:
     """One connecting road for neighbouring lanes.
 
@@ -62,16 +63,19 @@ def connect(
       arms: where it comes from and where it goes.
       fit: makes the reference line, which is the left border of the first lane.
       outside: whether shoulder and sidewalk go along.
+      edge: width of a shoulder of its own at both ends, m.
     """
     path = fit(lanes_in[0].pose, lanes_out[0].pose)
     pairs = list(zip(lanes_in, lanes_out, strict=True))
     if outside:
         pairs += _same_kind(arms[0].outside(True), arms[1].outside(False))
     distance = geometry.length(path)
-    specs = tuple(LaneSpec(a.spec.kind, _width(a.width, b.width, distance)) for a, b in pairs)
+    specs = [LaneSpec(a.spec.kind, _width(a.width, b.width, distance)) for a, b in pairs]
+    if edge:
+        specs.append(LaneSpec("shoulder", _width(*edge, distance)))
     road = town.add_road(
         path,
-        [Section(0.0, (), specs)],
+        [Section(0.0, (), tuple(specs))],
         min(arms[0].road.speed, arms[1].road.speed),
         kind=arms[0].road.kind,
         junction=junction.id,

@@ -1,6 +1,7 @@
 """Reference lines: lines, arcs, clothoids and cubics that join two poses with one tangent.
 
-Curvature is positive to the left. The clothoid fits are pyclothoids', which scenariogeneration brings along.
+Curvature is positive to the left. The clothoid fits are made by pyclothoids, which comes with
+scenariogeneration.
 """
 
 from __future__ import annotations
@@ -104,7 +105,8 @@ def chain(start: Pose, *stretches: tuple[float, float, float]) -> Path:
 
     Args:
       start: first pose.
-      *stretches: (length m, curvature at its start 1/m, curvature at its end 1/m); empty ones are left out.
+      *stretches: (length m, curvature at its start 1/m, curvature at its end 1/m); empty ones
+        are left out.
     """
     pieces: list[Piece] = []
     for distance, k0, k1 in stretches:
@@ -151,7 +153,7 @@ def bend(start: Pose, goal: Pose, radius: float, easing: float) -> Path:
     arc = radius * abs(angle) - easing
     eased = chain(Pose(0, 0, 0), (easing, 0, 1 / radius), (arc, 1 / radius, 1 / radius))
     x, y, yaw = eased[0].end
-    # The eased bend replaces the plain corner: source: textbook layout of a clothoid-arc-clothoid curve.
+    # The clothoids move the arc inwards by `inset`, so the bend begins further from the corner.
     inset = y - radius * (1 - math.cos(yaw))
     tangent = (radius + inset) * math.tan(abs(angle) / 2) + x - radius * math.sin(yaw)
     if arc < 0 or tangent > min(to_corner, from_corner) + 1e-9:

@@ -1,4 +1,4 @@
-"""`grid`: a signalised city of 4 x 3 blocks with two avenues of 2 + 2 lanes and rounded outer corners."""
+"""`grid`: a signalised city of 4 x 3 blocks, two avenues of 2 + 2 lanes, rounded outer corners."""
 
 from __future__ import annotations
 

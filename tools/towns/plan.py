@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Sequence
 
 from towns import geometry
@@ -87,8 +88,8 @@ class Road:
       junction: id of the junction it lies in, or None.
       heights: (s, a, b, c, d) records of the elevation profile; empty is flat at 0.
       before, after: ("road", id, contact) or ("junction", id, None).
-      links: {(section, lane id): (predecessor lane id, successor lane id)}, None where there is none.
-      signals, references, objects: filled by `signals.py`, dictionaries of what is written.
+      links: {(section, lane id): (predecessor lane id, successor lane id)}, None for none.
+      signals, references, objects: filled by `signs.py`, dictionaries of what is written.
     """
 
     id: int
@@ -142,7 +143,7 @@ class Arm:
         """The reference line's end, looking into the junction."""
         if self.contact == "end":
             return geometry.end(self.road.path)
-        return self.road.path[0].start.turned(3.141592653589793)
+        return self.road.path[0].start.turned(math.pi)
 
     @property
     def section(self) -> int:
@@ -159,7 +160,7 @@ class Arm:
         s = self.road.length - section.s if self.contact == "end" else 0.0
         right = incoming == (self.contact == "end")
         specs = section.right if right else section.left
-        pose = self.pose if incoming else self.pose.turned(3.141592653589793)
+        pose = self.pose if incoming else self.pose.turned(math.pi)
         offset, result = 0.0, []
         for index, spec in enumerate(specs):
             result.append(
@@ -193,7 +194,7 @@ class Connection:
 
 @dataclasses.dataclass
 class Junction:
-    """A junction with its connections and the controllers of its lights, in the order of service."""
+    """A junction, its connections, and the controllers of its lights in the order of service."""
 
     id: int
     arms: tuple[Arm, ...]

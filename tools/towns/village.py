@@ -1,0 +1,212 @@
+"""`village`: winding, hilly roads between stop and yield junctions around a roundabout."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+from towns import geometry, signs
+from towns.crossing import add_junction, connect_all
+from towns.geometry import Pose
+from towns.plan import (
+    CENTRE_BROKEN,
+    LANE_WIDTH,
+    SOLID,
+    Arm,
+    Cubic,
+    LaneSpec,
+    Road,
+    Section,
+    Town,
+    ease,
+    lane,
+)
+
+STREET_SPEED, ROAD_SPEED = 30.0, 50.0
+# From the middle of a junction to its arms, m.
+ROOM = 13.0
+# Roundabout: lane centre radius, lane width, distance of the arms, half the angle that an arm takes.
+RING_RADIUS, RING_WIDTH, RING_ROOM, RING_HALF = 15.0, 4.5, 27.0, math.radians(30.0)
+NARROW, PARKING = 2.9, 2.2
+
+
+@dataclasses.dataclass(frozen=True)
+class Node:
+    """A junction: where it lies, how high, the directions of its arms (degrees), who waits.
+
+    Attributes:
+      x, y, height: m.
+      directions: of the arms by name, degrees counter-clockwise from east, outwards.
+      stops, yields: arms with such a sign.
+      room: from its middle to the arms, m.
+    """
+
+    x: float
+    y: float
+    height: float
+    directions: dict[str, float]
+    stops: str = ""
+    yields: str = ""
+    room: float = ROOM
+
+    def exit(self, name: str) -> Pose:
+        """Where an arm begins, looking outwards."""
+        direction = math.radians(self.directions[name])
+        return Pose(self.x, self.y, geometry.wrap(direction)).ahead(self.room)
+
+
+NODES = {
+    "C": Node(0, 0, 0, {"e": 0, "n": 90, "w": 180, "s": 270}, yields="enws", room=RING_ROOM),
+    "E": Node(150, 20, 2, {"e": 10, "n": 95, "w": 185, "s": 275}, stops="enws"),
+    "N": Node(-15, 140, 3, {"e": 10, "w": 180, "s": 275}, stops="s"),
+    "W": Node(-150, -10, 1, {"e": 5, "n": 90, "w": 175, "s": 265}, yields="ew"),
+    "S": Node(15, -140, -1, {"e": 0, "n": 95, "w": 175, "s": 275}, stops="ns"),
+    "F": Node(175, -135, 4, {"e": 10, "n": 95, "w": 180}, yields="n"),
+}
+
+
+def build() -> Town:
+    """The whole town."""
+    town = Town("village")
+    arms: dict[str, dict[str, Arm]] = {name: {} for name in NODES}
+    for start, goal, via, kind in (
+        ("Ce", "Ew", [], "street"),
+        ("Cn", "Ns", [], "street"),
+        ("Cw", "We", [], "street"),
+        ("Cs", "Sn", [], "street"),
+        ("Ne", "En", [(70, 165, -5), (135, 120, -55)], "road"),
+        ("Wn", "Nw", [(-140, 70, 65), (-90, 125, 30)], "parking"),
+        ("Sw", "Ws", [(-70, -120, 165), (-125, -85, 125)], "narrow"),
+        ("Se", "Fw", [(95, -150, 0)], "street"),
+        ("Fn", "Es", [], "street"),
+        ("Ee", "Fe", [(215, 35, 10), (270, -30, -85), (235, -115, -150)], "road"),
+        ("Ss", "Ww", [(-20, -200, 200), (-120, -190, 170), (-205, -110, 100)], "road"),
+    ):
+        _add_link(town, arms, (start, goal), [_pose(*each) for each in via], kind)
+    for name, node in NODES.items():
+        if name == "C":
+            _add_roundabout(town, node, arms[name])
+        else:
+            _add_crossing(town, node, arms[name])
+    signs.add_speed_signs(town)
+    return town
+
+
+def _pose(x: float, y: float, degrees: float) -> Pose:
+    return Pose(float(x), float(y), math.radians(degrees))
+
+
+def _add_link(
+    town: Town,
+    arms: dict[str, dict[str, Arm]],
+    ends: tuple[str, str],
+    via: list[Pose],
+    kind: str,
+) -> None:
+    first, last = (NODES[each[0]] for each in ends)
+    goal = last.exit(ends[1][1]).turned(math.pi)
+    path = geometry.wind(first.exit(ends[0][1]), *via, goal)
+    length = geometry.length(path)
+    # Long roads lead over a hill or through a dip, the short ones straight from height to height.
+    middle = (first.height + last.height) / 2 + (5.0 if kind == "road" else 0.0)
+    road = town.add_road(
+        path,
+        _sections(kind, length),
+        ROAD_SPEED if kind == "road" else STREET_SPEED,
+        kind="rural" if kind == "road" else "town",
+        heights=_hill(first.height, middle, last.height, length),
+    )
+    arms[ends[0][0]][ends[0][1]] = Arm(road, "start")
+    arms[ends[1][0]][ends[1][1]] = Arm(road, "end")
+
+
+def _hill(start: float, middle: float, end: float, length: float) -> tuple[Cubic, ...]:
+    half = length / 2
+    return (ease(0.0, start, middle, half), ease(half, middle, end, half))
+
+
+def _sections(kind: str, length: float) -> list[Section]:
+    if kind == "road":
+        side = (lane("driving", LANE_WIDTH, SOLID), lane("shoulder", 1.5))
+        return [Section(0.0, side, side, CENTRE_BROKEN)]
+    walk = (lane("shoulder", 1.0), lane("sidewalk", 2.0))
+    plain = (lane("driving", LANE_WIDTH, SOLID), *walk)
+    if kind == "narrow":
+        side = (_waist(length), *walk)
+        return [Section(0.0, side, side, SOLID)]
+    whole = Section(0.0, plain, plain, SOLID)
+    if kind == "parking":
+        start, end = 40.0, length - 40.0
+        wide = (plain[0], _bay(end - start), *walk)
+        return [
+            whole,
+            dataclasses.replace(whole, s=start, right=wide),
+            dataclasses.replace(whole, s=end),
+        ]
+    return [whole]
+
+
+def _waist(length: float) -> LaneSpec:
+    """A driving lane that is narrow along its middle."""
+    taper, from_end = 20.0, 15.0
+    widths = (
+        (0.0, LANE_WIDTH, 0.0, 0.0, 0.0),
+        ease(from_end, LANE_WIDTH, NARROW, taper),
+        (from_end + taper, NARROW, 0.0, 0.0, 0.0),
+        ease(length - from_end - taper, NARROW, LANE_WIDTH, taper),
+        (length - from_end, LANE_WIDTH, 0.0, 0.0, 0.0),
+    )
+    return LaneSpec("driving", widths, SOLID)
+
+
+def _bay(length: float) -> LaneSpec:
+    """A parking lane that opens and closes."""
+    taper = 6.0
+    widths = (
+        ease(0.0, 0.0, PARKING, taper),
+        (taper, PARKING, 0.0, 0.0, 0.0),
+        ease(length - taper, PARKING, 0.0, taper),
+    )
+    return LaneSpec("parking", widths)
+
+
+def _add_crossing(town: Town, node: Node, at: dict[str, Arm]) -> None:
+    junction = add_junction(town, list(at.values()), node.height)
+    connect_all(town, junction)
+    for name, arm in at.items():
+        if name in node.stops + node.yields:
+            kind = signs.STOP if name in node.stops else signs.YIELD
+            signs.add_sign(town, arm, junction.connections, kind)
+            signs.add_stop_line(town, arm)
+        if name in node.stops:
+            signs.add_crosswalk(town, arm, junction.connections)
+
+
+def _add_roundabout(town: Town, node: Node, at: dict[str, Arm]) -> None:
+    """A ring of one-way roads; a junction at every arm joins the ring, the way in and the way out."""
+    names = sorted(at, key=lambda name: node.directions[name])
+    ring = [
+        _ring_road(town, node, node.directions[a], node.directions[b])
+        for a, b in zip(names, names[1:] + names[:1], strict=True)
+    ]
+    for index, name in enumerate(names):
+        arm = at[name]
+        parts = [arm, Arm(ring[index - 1], "end"), Arm(ring[index], "start")]
+        junction = add_junction(town, parts, node.height)
+        connect_all(town, junction)
+        signs.add_sign(town, arm, junction.connections, signs.YIELD)
+
+
+def _ring_road(town: Town, node: Node, first: float, second: float) -> Road:
+    """The stretch of the ring between two arms, given by their directions in degrees."""
+    radius = RING_RADIUS - RING_WIDTH / 2
+    start = math.radians(first) + RING_HALF
+    angle = math.radians((second - first) % 360) - 2 * RING_HALF
+    middle = Pose(node.x, node.y, geometry.wrap(start))
+    path = geometry.chain(
+        middle.ahead(radius).turned(math.pi / 2), (radius * angle, 1 / radius, 1 / radius)
+    )
+    lanes = (lane("driving", RING_WIDTH, SOLID), lane("shoulder", 1.0), lane("sidewalk", 2.0))
+    section = Section(0.0, (), lanes, SOLID)
+    heights = ((0.0, node.height, 0.0, 0.0, 0.0),) if node.height else ()
+    return town.add_road(path, [section], STREET_SPEED, heights=heights)
