@@ -24,6 +24,33 @@ def is_near_in_height(ego: EgoState, agents: Agents, z_gap: jax.Array | float) -
     return agents.valid & (jnp.abs(agents.z - ego.z) < z_gap)
 
 
+def touched(
+    ego: EgoState, agents: Agents, vehicle: VehicleParams, z_gap: jax.Array | float
+) -> jax.Array:
+    """Whom the ego touches.
+
+    Args:
+      ego: the ego.
+      agents: the others, of any kind.
+      vehicle: the ego's box.
+      z_gap: m, height difference that keeps boxes apart.
+
+    Returns:
+      (N,) bool.
+    """
+    overlap = geometry.boxes_overlap(
+        ego.xy,
+        ego.yaw,
+        vehicle.length,
+        vehicle.width,
+        agents.xy,
+        agents.yaw,
+        agents.length,
+        agents.width,
+    )
+    return overlap & is_near_in_height(ego, agents, z_gap)
+
+
 def collided(
     ego: EgoState, agents: Agents, vehicle: VehicleParams, z_gap: jax.Array | float
 ) -> jax.Array:
@@ -38,14 +65,4 @@ def collided(
     Returns:
       () bool.
     """
-    overlap = geometry.boxes_overlap(
-        ego.xy,
-        ego.yaw,
-        vehicle.length,
-        vehicle.width,
-        agents.xy,
-        agents.yaw,
-        agents.length,
-        agents.width,
-    )
-    return jnp.any(overlap & is_near_in_height(ego, agents, z_gap))
+    return jnp.any(touched(ego, agents, vehicle, z_gap))
