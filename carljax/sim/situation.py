@@ -26,7 +26,7 @@ JUNCTION_LOOK_AHEAD = 18  # route points ahead at which the ego is seen to be ab
 
 def situation(
     ego: EgoState,
-    ego_size: tuple[float, float],
+    ego_size: jax.Array,
     road_map: RoadMap,
     stretch: Route,
     stretch_start: jax.Array,
@@ -37,7 +37,7 @@ def situation(
 
     Args:
       ego: the ego.
-      ego_size: its length and width, m.
+      ego_size: (2,) its length and width, m.
       road_map: the map.
       stretch: window of the route around the ego.
       stretch_start: () int32, the window's first route index.
@@ -53,6 +53,7 @@ def situation(
         lane_lateral=lane.lateral,
         lane_yaw=lane.yaw,
         lane_width=lane.width,
+        lane_z=lane.z,
         lane_in_junction=lane.in_junction,
         on_parking=(centre & LAYER_PARKING) > 0,
         off_road_frac=off_road_frac(ego, ego_size, road_map, stretch.town),
@@ -86,7 +87,7 @@ def yellow_left(road_map: RoadMap, stretch: Route, light_time: jax.Array) -> jax
 
 
 def off_road_frac(
-    ego: EgoState, ego_size: tuple[float, float], road_map: RoadMap, town: jax.Array
+    ego: EgoState, ego_size: jax.Array, road_map: RoadMap, town: jax.Array
 ) -> jax.Array:
     """() fraction of the ego's footprint that is on neither road, parking lane nor shoulder."""
     along = jnp.linspace(-0.5, 0.5, FOOTPRINT[0], dtype=jnp.float32) * ego_size[0]

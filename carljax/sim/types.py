@@ -99,6 +99,7 @@ class Situation:
       lane_lateral: () m, offset from the nearest driving lane's centre, positive to its left.
       lane_yaw: () rad, direction of travel of that lane at its nearest point.
       lane_width: () m, its width there.
+      lane_z: () m, its height there.
       lane_in_junction: () bool.
       on_parking: () bool, ego centre is on a parking lane.
       off_road_frac: () fraction of the ego's footprint on neither road, parking nor shoulder.
@@ -119,6 +120,7 @@ class Situation:
     lane_lateral: jax.Array
     lane_yaw: jax.Array
     lane_width: jax.Array
+    lane_z: jax.Array
     lane_in_junction: jax.Array
     on_parking: jax.Array
     off_road_frac: jax.Array

@@ -1,0 +1,263 @@
+"""The driving environment: the only file that composes the simulator.
+
+One environment, unbatched; `vmap` goes above. Order of a step: the ego moves by the action, traffic moves by
+its own rules, one far-away car may be used again nearby, the clock of the lights goes on; then the reward
+looks at where everything is now.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+from carljax.reward import reward
+from carljax.reward.config import RewardConfig
+from carljax.sim import bicycle, route, situation, spawn, traffic
+from carljax.sim.observation import observe
+from carljax.sim.bicycle import VehicleParams
+from carljax.sim.idm import IDMParams
+from carljax.sim.rasterizer import RasterConfig
+from carljax.sim.scenario import ScenarioBank
+from carljax.sim.types import EgoState, RewardTerms, SimState, Situation, State
+
+
+ACTION_SIZE = 2
+LIGHT_CLOCK = 600.0  # s, the light clock starts anywhere in it
+
+
+@dataclasses.dataclass(frozen=True)
+class EnvConfig:
+    """The simulated world and what is seen of it."""
+
+    dt: float = 0.1
+    """Length of a step, s. source: paper, Engineering, 10 Hz"""
+    num_agents: int = 32
+    """Most other cars around the ego at once."""
+    route_length: float = 1000.0
+    """Length of a route, m. source: paper, Scenario Generation"""
+    raster: RasterConfig = dataclasses.field(default_factory=RasterConfig)
+    """The bird's-eye view image."""
+
+
+@struct.dataclass
+class DrivingEnv:
+    """Everything an episode needs and doesn't change; an argument of jitted functions.
+
+    Attributes:
+      bank: towns, routes and traffic.
+      reward_config: numbers and options of the reward.
+      vehicle: the ego's car.
+      idm: the other drivers.
+      config: sizes, static.
+    """
+
+    bank: ScenarioBank
+    reward_config: RewardConfig
+    vehicle: VehicleParams
+    idm: IDMParams
+    config: EnvConfig = struct.field(pytree_node=False)
+
+    @property
+    def action_size(self) -> int:
+        """Length of an action: steering and longitudinal, each in [-1, 1]."""
+        return ACTION_SIZE
+
+    def reset(self, key: jax.Array) -> State:
+        """Returns the first state of a scenario drawn from the bank."""
+        return self.observe(self.start(key))
+
+    def step(self, state: State, action: jax.Array) -> State:
+        """Returns the state after one step of `config.dt`.
+
+        Args:
+          state: unbatched, not done.
+          action: (2,) float32 in [-1, 1]: steering (positive left), throttle (positive) or brake.
+        """
+        return self.observe(self.advance(state, action))
+
+    def start(self, key: jax.Array) -> State:
+        """Returns what `reset` does, without the observation."""
+        key_scenario, key = jax.random.split(key)
+        scenario_idx = jax.random.randint(key_scenario, (), 0, self.bank.num_scenarios)
+        return self.start_scenario(scenario_idx, key)
+
+    def start_scenario(self, scenario_idx: jax.Array, key: jax.Array) -> State:
+        """Returns the first state of a given scenario, without the observation.
+
+        Args:
+          scenario_idx: () int32, row of the bank.
+          key: PRNG key, of all that the scenario leaves open.
+        """
+        key_agents, key_light, key = jax.random.split(key, 3)
+        bank, zero_idx = self.bank, jnp.zeros((), jnp.int32)
+        stretch, first = route.window(bank.routes, scenario_idx, zero_idx)
+        light_time = jax.random.uniform(key_light, (), maxval=LIGHT_CLOCK)
+        ego = _ego_at(stretch.xy[0], stretch.yaw[0])
+        seen = self._situation(ego, stretch, first, zero_idx, light_time)
+        agents = traffic.initial(
+            bank.agent_lane[scenario_idx],
+            bank.agent_s[scenario_idx],
+            bank.agent_speed[scenario_idx],
+            bank.road_map,
+            key_agents,
+        )
+        sim = SimState(
+            ego=ego.replace(z=seen.lane_z),
+            agents=agents,
+            reward_state=reward.init(ego, seen),
+            scenario_idx=scenario_idx.astype(jnp.int32),
+            route_idx=zero_idx,
+            light_time=light_time,
+            step_count=zero_idx,
+            key=key,
+        )
+        zero = jnp.zeros((), jnp.float32)
+        return State(
+            pipeline_state=sim,
+            obs=None,
+            reward=zero,
+            done=zero,
+            metrics=dict.fromkeys(METRICS, zero),
+            info={"truncation": zero},
+        )
+
+    def advance(self, state: State, action: jax.Array) -> State:
+        """Returns what `step` does, without the observation."""
+        before = state.pipeline_state
+        key, key_traffic, key_respawn = jax.random.split(before.key, 3)
+        dt, road_map = self.config.dt, self.bank.road_map
+        stretch, first = route.window(self.bank.routes, before.scenario_idx, before.route_idx)
+        idx = before.route_idx - first
+        ego = bicycle.step(before.ego, *bicycle.from_action(action), self.vehicle, dt)
+        place = situation.ego_place(before.ego, road_map, stretch, idx)
+        agents = traffic.step(
+            before.agents,
+            before.ego,
+            jnp.float32(self.vehicle.length),
+            place,
+            road_map,
+            before.light_time,
+            key_traffic,
+            self.idm,
+            dt,
+        )
+        agents = traffic.respawn(agents, ego, stretch.town, road_map, key_respawn, spawn.CELL)
+        light_time = before.light_time + dt
+        idx = route.advance(stretch, idx, ego.xy)
+        seen = self._situation(ego, stretch, first, idx, light_time)
+        paid, terminated, memory, terms = reward.compute(
+            before, ego, agents, seen, self.vehicle, self.reward_config, dt
+        )
+        after = before.replace(
+            ego=ego.replace(z=seen.lane_z),
+            agents=agents,
+            reward_state=memory,
+            route_idx=seen.route_idx,
+            light_time=light_time,
+            step_count=before.step_count + 1,
+            key=key,
+        )
+        # A finished route ends for good: there is nothing left to earn, so no value is bootstrapped.
+        ended = terminated | terms.finished
+        truncated = terms.timeout & ~ended
+        return State(
+            pipeline_state=after,
+            obs=None,
+            reward=paid,
+            done=(ended | truncated).astype(jnp.float32),
+            metrics=_metrics(state.metrics, after, seen, paid, terms, dt),
+            info={"truncation": truncated.astype(jnp.float32)},
+        )
+
+    def observe(self, state: State) -> State:
+        """Returns the state with what the policy and the critic see of it."""
+        return state.replace(obs=observe(self, state.pipeline_state))
+
+    def _situation(
+        self,
+        ego: EgoState,
+        stretch: Route,
+        first: jax.Array,
+        idx: jax.Array,
+        light_time: jax.Array,
+    ) -> Situation:
+        return situation.situation(
+            ego,
+            jnp.stack([jnp.float32(self.vehicle.length), jnp.float32(self.vehicle.width)]),
+            self.bank.road_map,
+            stretch,
+            first,
+            idx,
+            light_time,
+        )
+
+
+def make_env(bank: ScenarioBank, config: EnvConfig, reward_config: RewardConfig) -> DrivingEnv:
+    """Puts an environment together, with CARLA's saloon as the ego and IDM's city drivers around it."""
+    return DrivingEnv(
+        bank=bank,
+        reward_config=reward_config,
+        vehicle=VehicleParams(),
+        idm=IDMParams(),
+        config=config,
+    )
+
+
+def _ego_at(xy: jax.Array, yaw: jax.Array) -> EgoState:
+    """The ego at rest."""
+    zero = jnp.zeros((), jnp.float32)
+    return EgoState(
+        xy=xy,
+        z=zero,
+        yaw=yaw,
+        speed=zero,
+        slip=zero,
+        yaw_rate=zero,
+        accel=zero,
+        steer=zero,
+        throttle=zero,
+        brake=zero,
+    )
+
+
+ENDS = (*reward.CAUSES, "finished", "timeout")
+REWARD_METRICS = tuple(
+    f"reward/{name}" for name in ("progress", *reward.SOFT_FACTORS, *ENDS, "penalty")
+)
+EPISODE_METRICS = (
+    "episode/return",
+    "episode/length",
+    "episode/route_completion",
+    "episode/km",
+    "episode/outside_lanes_km",
+    *(f"episode/{name}_frac" for name in ENDS),
+)
+METRICS = (*REWARD_METRICS, *EPISODE_METRICS, "ego/speed")
+
+
+def _metrics(
+    old: dict[str, jax.Array],
+    after: SimState,
+    seen: Situation,
+    paid: jax.Array,
+    terms: RewardTerms,
+    dt: float,
+) -> dict[str, jax.Array]:
+    """What is logged of a step; `episode/` values add up within an episode and hold at its end."""
+    step = reward.metrics(terms)
+    driven = after.ego.speed * dt / 1000.0
+    outside = jnp.where(terms.soft["outside_lanes"] < 1.0, driven, 0.0)
+    completion = 100.0 * seen.route_s / seen.route_length
+    return {
+        **step,
+        **{f"episode/{name}_frac": step[f"reward/{name}"] for name in ENDS},
+        "episode/return": old["episode/return"] + paid,
+        "episode/length": after.step_count.astype(jnp.float32),
+        "episode/route_completion": jnp.where(terms.finished, 100.0, completion),
+        "episode/km": old["episode/km"] + driven,
+        "episode/outside_lanes_km": old["episode/outside_lanes_km"] + outside,
+        "ego/speed": after.ego.speed,
+    }
