@@ -20,8 +20,12 @@ STEP, CHORD_ERROR = 1.0, 0.008
 STEP_MIN = 0.05
 # A lane further from its road's line, or wider, than this is a typing error, m.
 OFFSET_MAX = 1000.0
-# Breaks closer than this to a neighbour add nothing, m.
+# Breaks closer than this to the one before add nothing, m.
 _MERGE = 1e-3
+# A lane's crossing with itself is looked for this many points either side of a fold.
+_LOOP = 200
+# Jumps and turns between two records up to this size are rounding, m and rad.
+_JUMP, _TURN = 0.02, 0.05
 
 
 @dataclasses.dataclass(frozen=True)
@@ -74,24 +78,103 @@ def _borders(
     return border, slopes
 
 
-def evaluate(road: RoadSpec, section: SectionSpec, s: np.ndarray) -> Sampled:
-    """The section at arc lengths `s`; at its end the records that end there still hold."""
-    pick = np.minimum(s, max(section.s0, np.nextafter(section.s1, -np.inf)))
-    xy, yaw, bend = rl.evaluate(road.line, s, pick)
-    border, slope = _borders(road, section, s, pick)
+@dataclasses.dataclass(frozen=True)
+class Positions:
+    """Where to sample a section.
+
+    Attributes:
+      s: (P,) m, never falling.
+      pick: (P,) m, chooses the records in force: just below s where a record ends.
+      turn: (P,) rad, added to the heading: rounds the corner where two geometries meet at an angle.
+    """
+
+    s: np.ndarray
+    pick: np.ndarray
+    turn: np.ndarray
+
+    def insert(self, rows: np.ndarray, s: np.ndarray) -> Positions:
+        """With plain positions `s` in front of the given rows."""
+        return Positions(
+            np.insert(self.s, rows, s), np.insert(self.pick, rows, s), np.insert(self.turn, rows, 0.0)
+        )
+
+
+def evaluate(road: RoadSpec, section: SectionSpec, at: Positions) -> Sampled:
+    """The section at some positions; at its end the records that end there still hold."""
+    pick = np.minimum(at.pick, max(section.s0, np.nextafter(section.s1, -np.inf)))
+    xy, yaw, bend = rl.evaluate(road.line, at.s, pick)
+    yaw = yaw + at.turn
+    border, slope = _borders(road, section, at.s, pick)
     normal = np.stack([-np.sin(yaw), np.cos(yaw)], axis=-1)
-    return Sampled(s, xy, normal, yaw, bend, road.elevation.at(s, pick)[0], border, slope)
+    return Sampled(at.s, xy, normal, yaw, bend, road.elevation.at(at.s, pick)[0], border, slope)
+
+
+def _plain(s: np.ndarray) -> Positions:
+    return Positions(s, s, np.zeros_like(s))
 
 
 def _breaks(road: RoadSpec, section: SectionSpec) -> np.ndarray:
-    """Arc lengths where a record of the section begins, with its two ends."""
+    """Arc lengths inside the section where a record begins."""
     starts = [road.line.start, road.lane_offset.start]
     starts += [lane.width.start for lane in section.lanes.values()]
     inside = np.unique(np.concatenate(starts))
-    inside = inside[(inside > section.s0 + _MERGE) & (inside < section.s1 - _MERGE)]
-    if len(inside):
-        inside = inside[np.concatenate([[True], np.diff(inside) > _MERGE])]
-    return np.concatenate([[section.s0], inside, [section.s1]])
+    return inside[(inside > section.s0) & (inside < section.s1)]
+
+
+def _corners(
+    road: RoadSpec, section: SectionSpec, breaks: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """What happens at the breaks: jump sideways (m), turn of the heading (rad), and reach of the lanes (m)."""
+    before = Positions(breaks, np.nextafter(breaks, -np.inf), np.zeros_like(breaks))
+    a, b = evaluate(road, section, before), evaluate(road, section, _plain(breaks))
+    jump = np.hypot(*(b.xy - a.xy).T)
+    for lane_id in a.border:
+        jump = np.maximum(jump, np.abs(b.border[lane_id] - a.border[lane_id]))
+    turn = np.mod(b.yaw - a.yaw + np.pi, 2 * np.pi) - np.pi
+    reach = np.max([np.abs(t) for t in b.border.values()], axis=0)
+    return jump, turn, reach
+
+
+def _round_corner(at: float, turn: float, reach: float) -> Positions:
+    """Positions around a corner of the reference line, all at the same s."""
+    count = int(min(np.ceil(abs(turn) * min(reach, 50.0) / (STEP / 2)) + 1, 100))
+    part = np.linspace(1.0, 0.0, count + 1)
+    s = np.full(count + 1, at)
+    return Positions(s, s, -turn * part)
+
+
+def _first_positions(road: RoadSpec, section: SectionSpec) -> tuple[Positions, np.ndarray]:
+    """Positions STEP apart at most, with all breaks; and the breaks at which a record jumps.
+
+    A jump becomes a ramp of twice its size along the road, a corner of the heading an arc.
+    """
+    breaks = _breaks(road, section)
+    knots, corners, jumps = [section.s0], {}, []
+    sizes = _corners(road, section, breaks) if len(breaks) else ([], [], [])
+    for i, (at, jump, turn, reach) in enumerate(zip(breaks, *sizes, strict=True)):
+        if jump > _JUMP:
+            low = (at + max(section.s0, breaks[i - 1] if i else -np.inf)) / 2
+            high = (at + min(section.s1, breaks[i + 1] if i + 1 < len(breaks) else np.inf)) / 2
+            half = min(jump, STEP / 2)
+            knots += [max(at - half, low), min(at + half, high)]
+            jumps.append(at)
+        elif abs(turn) > _TURN:
+            corners[len(knots)] = _round_corner(at, turn, reach)
+            knots.append(at)
+        elif at > knots[-1] + _MERGE and at < section.s1 - _MERGE:
+            knots.append(at)
+    knots.append(section.s1)
+    parts = []
+    for i, (start, end) in enumerate(zip(knots, knots[1:], strict=False)):
+        count = max(int(np.ceil((end - start) / STEP - 1e-9)), 1)
+        if i in corners:
+            parts.append(corners[i])
+        s = np.linspace(start, end, count, endpoint=False)
+        parts.append(_plain(s[1:] if i in corners else s))
+    parts.append(_plain(np.array([section.s1])))
+    fields = ("s", "pick", "turn")
+    joined = [np.concatenate([getattr(p, f) for p in parts]) for f in fields]
+    return Positions(*joined), np.array(jumps)
 
 
 def _too_coarse(ends: Sampled, middle: Sampled) -> np.ndarray:
@@ -111,20 +194,18 @@ def _too_coarse(ends: Sampled, middle: Sampled) -> np.ndarray:
     return ((size > STEP) | (error > CHORD_ERROR)).any(axis=0)
 
 
-def sample_positions(road: RoadSpec, section: SectionSpec) -> np.ndarray:
-    """Arc lengths to sample a section at, its two ends and the starts of all records among them."""
-    breaks = _breaks(road, section)
-    count = np.maximum(np.ceil(np.diff(breaks) / STEP - 1e-9).astype(int), 1)
-    parts = [np.linspace(a, b, n, endpoint=False) for a, b, n in zip(breaks, breaks[1:], count, strict=False)]
-    s = np.concatenate([*parts, [section.s1]])
+def sample_positions(road: RoadSpec, section: SectionSpec) -> Positions:
+    """Where to sample a section: its two ends, the starts of all records, and as densely as need be."""
+    at, jumps = _first_positions(road, section)
     for _ in range(6):  # halves a step of 1 m down to STEP_MIN at most
-        middle = (s[1:] + s[:-1]) / 2
-        bad = _too_coarse(evaluate(road, section, s), evaluate(road, section, middle))
-        bad &= np.diff(s) > 2 * STEP_MIN
+        middle = _plain((at.s[1:] + at.s[:-1]) / 2)
+        bad = np.diff(at.s) > 2 * STEP_MIN
+        bad &= np.searchsorted(jumps, at.s[1:]) == np.searchsorted(jumps, at.s[:-1])
+        bad &= _too_coarse(evaluate(road, section, at), evaluate(road, section, middle))
         if not bad.any():
             break
-        s = np.sort(np.concatenate([s, middle[bad]]))
-    return s
+        at = at.insert(np.flatnonzero(bad) + 1, middle.s[bad])
+    return at
 
 
 def _in_force(records: tuple[tuple[float, float | None], ...], s: float) -> float | None:
@@ -134,6 +215,46 @@ def _in_force(records: tuple[tuple[float, float | None], ...], s: float) -> floa
         if start <= s:
             value = speed
     return value
+
+
+def _crossing(xy: np.ndarray, before: slice, after: slice) -> tuple[int, int] | None:
+    """The first segment of `before` that a segment of `after` crosses, and the last such one."""
+    p, q = xy[before][:-1, None], xy[after][:-1]
+    d, e = np.diff(xy[before], axis=0)[:, None], np.diff(xy[after], axis=0)
+    det = d[..., 0] * e[..., 1] - d[..., 1] * e[..., 0]
+    det = np.where(det == 0.0, np.inf, det)
+    off = q - p
+    u = (off[..., 0] * e[..., 1] - off[..., 1] * e[..., 0]) / det
+    v = (off[..., 0] * d[..., 1] - off[..., 1] * d[..., 0]) / det
+    i, j = np.nonzero((u >= 0.0) & (u <= 1.0) & (v >= 0.0) & (v <= 1.0) & np.isfinite(det))
+    return (before.start + int(i[0]), after.start + int(j[i == i[0]][-1])) if len(i) else None
+
+
+def _onward(xy: np.ndarray, yaw: np.ndarray) -> np.ndarray:
+    """Rows of the points but for those in loops.
+
+    On the inside of a bend tighter than its distance from the reference line a lane goes backwards and
+    crosses itself. A car cuts that loop off; where the fold reaches the lane's end it stops short of it.
+    """
+    heading = np.stack([np.cos(yaw), np.sin(yaw)], axis=-1)
+    step = np.diff(xy, axis=0)
+    back = np.flatnonzero((step * (heading[:-1] + heading[1:])).sum(axis=-1) < 0.0)
+    keep = np.ones(len(xy), bool)
+    while len(back):
+        gaps = np.flatnonzero(np.diff(back) > 1)
+        first, last = int(back[0]), int(back[gaps[0]] if len(gaps) else back[-1])
+        low, high = max(first - _LOOP, 0), min(last + 1 + _LOOP, len(xy) - 1)
+        cut = _crossing(xy, slice(low, first + 1), slice(last + 1, high + 1))
+        if cut is not None:
+            keep[cut[0] + 1 : cut[1] + 1] = False
+        elif last == len(step) - 1:
+            ahead = ((xy[-1] - xy[low:-1]) * heading[low:-1]).sum(axis=-1) > 0.0
+            keep[low:-1] &= np.logical_and.accumulate(ahead)
+        elif first == 0:
+            ahead = ((xy[1:high] - xy[0]) * heading[1:high]).sum(axis=-1) > 0.0
+            keep[1:high] &= np.logical_and.accumulate(ahead[::-1])[::-1]
+        back = back[back > last]
+    return np.flatnonzero(keep)
 
 
 def _lane(
@@ -152,9 +273,10 @@ def _lane(
     # t the lane folds over, its heading stays that of the road.
     yaw = at.yaw + np.arctan2(slope, np.maximum(1.0 - at.bend * t, 1e-2))
     xyz = np.column_stack([at.line(t), at.z])
+    rows = _onward(xyz[:, :2], yaw)
     along = road.travels_along(spec)
-    step = slice(None) if along else slice(None, None, -1)
     yaw = yaw if along else yaw + np.pi
+    rows = rows if along else rows[::-1]
     middle = (section.s0 + section.s1) / 2
     limit = _in_force(spec.speed, middle)
     return Lane(
@@ -162,10 +284,10 @@ def _lane(
         section=section.index,
         lane_id=spec.id,
         kind=spec.kind,
-        xyz=xyz[step],
-        width=np.maximum(width, 0.0)[step],
-        s=at.s[step],
-        yaw=(np.mod(yaw + np.pi, 2 * np.pi) - np.pi)[step],
+        xyz=xyz[rows],
+        width=np.maximum(width, 0.0)[rows],
+        s=at.s[rows],
+        yaw=(np.mod(yaw + np.pi, 2 * np.pi) - np.pi)[rows],
         junction=road.junction,
         speed_limit=limit if limit is not None else _in_force(road.speed, middle),
     )

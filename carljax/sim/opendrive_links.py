@@ -16,7 +16,7 @@ from carljax.sim.opendrive_xml import Place, Warnings
 from carljax.sim.road_network import Junction, Lane
 
 # Lane ends this far apart still meet where the file contradicts itself about the contact point, m.
-_MEET = 1.0
+_MEET = 1.5
 
 
 @dataclasses.dataclass(frozen=True)

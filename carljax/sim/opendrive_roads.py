@@ -317,10 +317,10 @@ def _link(road: ET.Element, tag: str, place: Place, warnings: Warnings) -> RoadL
     kind = element.get("elementType", "road")
     if kind not in ("road", "junction"):
         raise place.error(f"{tag} is a {ox.shown(kind)}, neither road nor junction")
-    if element.get("elementS") is not None:
-        warnings.add("link into the middle of a road (virtual junction) is not read", place)
-        return None
     contact = element.get("contactPoint")
+    if element.get("elementS") is not None:
+        warnings.add("link into the middle of a road holds only if it is near that road's end", place)
+        contact = None
     if contact not in (None, "", "start", "end"):
         raise place.error(f"{tag} has contactPoint {ox.shown(contact or '')}")
     return RoadLink(kind, ox.text(element, "elementId", place), contact or None)
