@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import math
+import time
 from collections import deque
 from collections.abc import Mapping
 from pathlib import Path
@@ -28,6 +29,7 @@ from carljax import atomic
 
 FILE = "metrics.jsonl"
 TENSORBOARD_FOLDER = "tensorboard"
+LINE_EVERY_S = 20.0  # between two lines where there is no terminal for a bar
 
 
 class MetricsLog:
@@ -127,25 +129,68 @@ class WindowMean:
         return sum(self._values) / len(self._values) if self._values else math.nan
 
 
-def progress_bar(console: Console) -> Progress:
-    """Makes the bar of a training run: updates, reward, route completion, speed and time left.
+class Report:
+    """Shows how training goes: a bar on a terminal, a line now and then elsewhere.
 
-    Args:
-      console: where it is drawn; where that is no terminal, only the last state is printed.
-
-    Returns:
-      A `rich` progress; its task needs the fields `reward`, `completion` and `speed` (text).
+    Both give reward per step, route completion, samples per second and the time left.
     """
-    return Progress(
-        TextColumn("update"),
-        MofNCompleteColumn(),
-        BarColumn(bar_width=None),
-        TextColumn("reward {task.fields[reward]}"),
-        TextColumn("route {task.fields[completion]}"),
-        TextColumn("{task.fields[speed]}"),
-        TimeElapsedColumn(),
-        TextColumn("left"),
-        TimeRemainingColumn(),
-        console=console,
-        expand=True,
-    )
+
+    def __init__(self, console: Console, start_update: int, num_updates: int):
+        """Prepares the report.
+
+        Args:
+          console: where it is shown.
+          start_update: updates made before.
+          num_updates: updates of the whole run.
+        """
+        self._console = console
+        self._last_update = num_updates
+        self._last_line = -math.inf
+        self._bar = Progress(
+            TextColumn("update"),
+            MofNCompleteColumn(),
+            BarColumn(bar_width=None),
+            TextColumn("{task.description}"),
+            TimeElapsedColumn(),
+            TextColumn("left"),
+            TimeRemainingColumn(),
+            console=console,
+            expand=True,
+            disable=not console.is_terminal,
+        )
+        self._task = self._bar.add_task("compiling", total=num_updates, completed=start_update)
+
+    def show(self, update: int, metrics: Mapping[str, float]) -> None:
+        """Shows the state after an update.
+
+        Args:
+          update: updates made so far.
+          metrics: of that update.
+        """
+        text = (
+            f"reward {metrics['rollout/reward']:.3f}"
+            f"  route {metrics['episode/route_completion']:.1f} %"
+            f"  {metrics.get('time/env_steps_per_s', math.nan):,.0f} samples/s"
+        )
+        self._bar.update(self._task, completed=update, description=text)
+        now = time.monotonic()
+        due = now - self._last_line > LINE_EVERY_S or update == self._last_update
+        if due and not self._console.is_terminal:
+            self._last_line = now
+            self._console.print(f"update {update}/{self._last_update}  {text}{self._left()}")
+
+    def _left(self) -> str:
+        left = self._bar.tasks[self._task].time_remaining
+        return "" if left is None else f"  {left:.0f} s left"
+
+    def __enter__(self) -> Report:
+        self._bar.start()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._bar.stop()
