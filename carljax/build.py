@@ -1,0 +1,137 @@
+"""From a configuration to what runs: towns, scenario banks, environment, network, devices."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+from jax.sharding import Mesh
+
+from carljax import machine, memory
+from carljax.config import ConfigError, TrainConfig
+from carljax.memory import MemoryEstimate
+from carljax.ppo import trainer
+from carljax.ppo.networks import ActorCritic
+from carljax.ppo.rollout import rollout
+from carljax.ppo.types import TrainState
+from carljax.sim import scenario, town, towns
+from carljax.sim.env import DrivingEnv, make_env
+from carljax.sim.town import Town
+
+# Routes for scoring come from a seed that no training run may use, so that none is trained on.
+HELD_OUT_SEED = 1_000_000_007
+
+
+@dataclasses.dataclass(frozen=True)
+class Setup:
+    """All that a run needs but its training state.
+
+    Attributes:
+      config: what it was made from.
+      towns: on the host.
+      env: with the training routes, on every device.
+      network: actor and critic.
+      mesh: the devices.
+    """
+
+    config: TrainConfig
+    towns: Sequence[Town]
+    env: DrivingEnv
+    network: ActorCritic
+    mesh: Mesh
+
+
+def setup(config: TrainConfig) -> Setup:
+    """Reads the towns, draws the training routes and puts them on the devices.
+
+    Args:
+      config: the run's configuration.
+
+    Returns:
+      Everything but the training state.
+
+    Raises:
+      ConfigError: sizes that do not go together.
+      MapError: a town can't be read.
+      RouteError: a town is too small for the routes.
+    """
+    try:
+        mesh = trainer.make_mesh(config.run.num_devices)
+    except ValueError as error:
+        raise ConfigError(f"run.num_devices: {error}") from error
+    config.validate(mesh.size)
+    loaded = load_towns(config.run.maps)
+    training = environment(config, loaded, config.run.num_routes, config.run.seed)
+    training = trainer.replicate(training, mesh)
+    return Setup(config, loaded, training, ActorCritic(config.network), mesh)
+
+
+def load_towns(maps: Sequence[Path]) -> list[Town]:
+    """Reads the user's maps, or all bundled towns where there are none."""
+    return [town.load(path) for path in maps or [towns.path(name) for name in towns.names()]]
+
+
+def environment(
+    config: TrainConfig, loaded: Sequence[Town], num_routes: int, seed: int
+) -> DrivingEnv:
+    """Draws routes and makes the environment that drives on them.
+
+    Args:
+      config: the run's configuration.
+      loaded: the towns.
+      num_routes: over all towns.
+      seed: of routes and first places of traffic; `HELD_OUT_SEED` for scoring.
+
+    Returns:
+      The environment.
+    """
+    bank = scenario.make_bank(
+        loaded, num_routes, config.env.num_agents, seed, config.env.route_length
+    )
+    return make_env(bank, config.env, config.reward)
+
+
+def initial_state(made: Setup) -> TrainState:
+    """Makes the training state before the first update."""
+    key = jax.random.key(made.config.run.seed)
+    return trainer.init(key, made.env, made.network, made.config.ppo, made.mesh)
+
+
+def estimate_memory(made: Setup) -> tuple[int, MemoryEstimate]:
+    """Works out the size of the network and the memory of a run, allocating nothing.
+
+    Args:
+      made: see `setup`.
+
+    Returns:
+      Number of parameters, and the memory on one device.
+    """
+    ppo, num_devices = made.config.ppo, made.mesh.size
+
+    def shapes(env: DrivingEnv) -> tuple[TrainState, Any]:
+        state = initial_state(dataclasses.replace(made, env=env))
+        local = jax.tree.map(lambda x: x[: x.shape[0] // num_devices], state.env_state)
+        keys = jax.random.split(state.key, ppo.num_envs // num_devices)
+        batch = rollout(env, made.network, state.params, local, keys, ppo.num_steps)[1]
+        return state.replace(env_state=local), batch
+
+    state, batch = jax.eval_shape(shapes, made.env)
+    at_once = ppo.micro_batch_size or ppo.minibatch_size // num_devices
+    obs = jax.tree.map(lambda x: jax.ShapeDtypeStruct((at_once, *x.shape[2:]), x.dtype), batch.obs)
+    parts = {
+        "towns and routes": memory.tree_bytes(made.env),
+        "parameters, gradients, optimiser": 2 * memory.tree_bytes(state.params)
+        + memory.tree_bytes(state.opt_state),
+        "environment states": memory.tree_bytes(state.env_state),
+        "rollout": memory.tree_bytes(batch),
+        f"activations of {at_once} samples (at most)": memory.activation_bytes(
+            made.network, state.params, obs
+        ),
+    }
+    available = machine.device_memory()
+    if jax.default_backend() == "cpu":
+        available //= num_devices
+    return memory.count(state.params), MemoryEstimate(parts, available)

@@ -1,0 +1,82 @@
+"""How much memory a training run will take, worked out from shapes before anything is allocated."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import Any
+
+import jax
+
+
+@dataclasses.dataclass(frozen=True)
+class MemoryEstimate:
+    """Memory on one device.
+
+    Attributes:
+      parts: {what: bytes}.
+      available: bytes that one device may use.
+    """
+
+    parts: dict[str, int]
+    available: int
+
+    @property
+    def total(self) -> int:
+        """Sum of the parts, bytes."""
+        return sum(self.parts.values())
+
+    @property
+    def fits(self) -> bool:
+        """Whether the parts fit into what is available."""
+        return self.total <= self.available
+
+
+def tree_bytes(tree: Any) -> int:
+    """Adds up the bytes of all arrays (or their shapes) in a tree.
+
+    Args:
+      tree: a pytree of arrays or `jax.ShapeDtypeStruct`.
+
+    Returns:
+      Bytes; a random key counts its words.
+    """
+    return sum(_leaf_bytes(leaf) for leaf in jax.tree.leaves(tree))
+
+
+def count(tree: Any) -> int:
+    """Counts the numbers in a tree of arrays: the parameters of a network."""
+    return sum(math.prod(leaf.shape) for leaf in jax.tree.leaves(tree))
+
+
+def activation_bytes(network: Any, params: Any, obs: Any) -> int:
+    """Estimates what a gradient keeps of the forward pass: all that the backward pass will read.
+
+    Args:
+      network: a flax module.
+      params: its variables, or their shapes.
+      obs: a batch of observations, or their shapes.
+
+    Returns:
+      Bytes; an estimate from above, since the compiler may recompute some of it.
+    """
+
+    def backward(params: Any, obs: Any) -> Any:
+        return jax.vjp(lambda p: network.apply(p, obs), params)[1]
+
+    return tree_bytes(jax.eval_shape(backward, params, obs))
+
+
+def readable(num_bytes: float) -> str:
+    """Writes a number of bytes for people: "3.2 GiB"."""
+    for unit in ("B", "KiB", "MiB"):
+        if num_bytes < 1024:
+            return f"{num_bytes:.3g} {unit}"
+        num_bytes /= 1024
+    return f"{num_bytes:.3g} GiB"
+
+
+def _leaf_bytes(leaf: Any) -> int:
+    if jax.dtypes.issubdtype(leaf.dtype, jax.dtypes.prng_key):
+        leaf = jax.eval_shape(jax.random.key_data, leaf)
+    return math.prod(leaf.shape) * leaf.dtype.itemsize
