@@ -1,0 +1,151 @@
+"""The Driving Score: route completion times a factor for each infraction.
+
+Source: CARLA leaderboard 2.0. One difference: here an episode ends at its first collision, red
+light, stop sign or other failure, where the leaderboard counts it and lets the car go on to the end
+of the route. So completion is lower here and no route has two of these infractions of different
+steps.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from rich.table import Table
+
+# source: CARLA leaderboard 2.0, infraction penalties
+FACTORS: Mapping[str, float] = {
+    "pedestrian_collision": 0.5,
+    "vehicle_collision": 0.6,
+    "static_collision": 0.65,
+    "red_light": 0.7,
+    "stop_sign": 0.8,
+}
+# Ends without a factor of their own: what they cost is the rest of the route.
+ENDS = ("off_road", "route_deviation", "blocked", "timeout")
+INFRACTIONS = (*FACTORS, *ENDS)
+
+
+@dataclasses.dataclass(frozen=True)
+class RouteScore:
+    """How one route went.
+
+    Attributes:
+      route: row in the bank of held-out routes.
+      town: its name.
+      length_km: of the route.
+      driven_km: by the ego.
+      seconds: of simulated time.
+      completion: percent of the route.
+      outside_frac: fraction of the driven distance outside lanes.
+      infractions: names of `INFRACTIONS` that happened; empty where the route was finished.
+    """
+
+    route: int
+    town: str
+    length_km: float
+    driven_km: float
+    seconds: float
+    completion: float
+    outside_frac: float
+    infractions: tuple[str, ...]
+
+    @property
+    def driving_score(self) -> float:
+        """Completion times the factors of what happened, percent."""
+        score = self.completion * (1.0 - self.outside_frac)
+        for name in self.infractions:
+            score *= FACTORS.get(name, 1.0)
+        return score
+
+
+@dataclasses.dataclass(frozen=True)
+class EvalResult:
+    """The scores of a set of routes."""
+
+    routes: tuple[RouteScore, ...]
+
+    @property
+    def driving_score(self) -> tuple[float, float]:
+        """Mean and standard deviation over routes, percent."""
+        return _mean_and_std([route.driving_score for route in self.routes])
+
+    @property
+    def completion(self) -> tuple[float, float]:
+        """Mean and standard deviation of route completion, percent."""
+        return _mean_and_std([route.completion for route in self.routes])
+
+    @property
+    def completed_km(self) -> float:
+        """Length of the routes as far as they were completed, summed up, km."""
+        return sum(route.length_km * route.completion / 100.0 for route in self.routes)
+
+    @property
+    def infractions_per_km(self) -> dict[str, float]:
+        """Number of each infraction divided by the completed km (at least a metre per route).
+
+        source: CARLA leaderboard 2.0, length times completion, at least 0.001 km
+        """
+        km = max(self.completed_km, 0.001 * len(self.routes))
+        return {
+            name: sum(name in route.infractions for route in self.routes) / km
+            for name in INFRACTIONS
+        }
+
+    @property
+    def finished_frac(self) -> float:
+        """Fraction of routes driven to their end."""
+        return sum(not route.infractions for route in self.routes) / len(self.routes)
+
+    def by_town(self) -> dict[str, EvalResult]:
+        """The same scores for each town apart."""
+        names = sorted({route.town for route in self.routes})
+        return {
+            name: EvalResult(tuple(route for route in self.routes if route.town == name))
+            for name in names
+        }
+
+    def to_json(self) -> dict[str, Any]:
+        """Summary and single routes, in values that JSON can hold."""
+        score, completion = self.driving_score, self.completion
+        return {
+            "driving_score_mean": score[0],
+            "driving_score_std": score[1],
+            "route_completion_mean": completion[0],
+            "route_completion_std": completion[1],
+            "finished_frac": self.finished_frac,
+            "num_routes": len(self.routes),
+            "completed_km": self.completed_km,
+            "infractions_per_km": self.infractions_per_km,
+            "routes": [
+                {**dataclasses.asdict(route), "driving_score": route.driving_score}
+                for route in self.routes
+            ],
+        }
+
+
+def table(result: EvalResult) -> Table:
+    """Lays out the scores for a terminal: all routes, then each town; below, infractions per km."""
+    out = Table(title=f"{len(result.routes)} held-out routes, deterministic policy")
+    for name in ("", "routes", "Driving Score", "route completion %", "finished %"):
+        out.add_column(name, justify="left" if not name else "right")
+    for town, part in {"all": result, **result.by_town()}.items():
+        score, completion = part.driving_score, part.completion
+        out.add_row(
+            town,
+            str(len(part.routes)),
+            f"{score[0]:.1f} ± {score[1]:.1f}",
+            f"{completion[0]:.1f} ± {completion[1]:.1f}",
+            f"{100 * part.finished_frac:.0f}",
+        )
+    out.add_section()
+    for name, rate in result.infractions_per_km.items():
+        factor = f"x {FACTORS[name]:.2f}" if name in FACTORS else "ends the route"
+        out.add_row(f"{name} per km", "", factor, f"{rate:.3f}", "")
+    return out
+
+
+def _mean_and_std(values: Sequence[float]) -> tuple[float, float]:
+    return float(np.mean(values)), float(np.std(values))
