@@ -1,0 +1,180 @@
+"""`python -m carljax.train [PRESET] ...`: learn to drive, save, be scored on held-out routes."""
+
+from __future__ import annotations
+
+import dataclasses
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+import jax
+import tyro
+from rich.console import Console
+
+from carljax import build, checkpoint, config, evaluate, learn, memory, presets, run_dir, scores
+from carljax.build import Setup
+from carljax.checkpoint import CheckpointError
+from carljax.config import ConfigError, TrainConfig
+from carljax.sim.road_network import MapError
+from carljax.sim.route_generator import RouteError
+
+PROG = "python -m carljax.train"
+
+
+@dataclasses.dataclass(frozen=True)
+class Command:
+    """What to train, field by field, and whether to start, to continue or only to look."""
+
+    config: Annotated[TrainConfig, tyro.conf.arg(name="")]
+    resume: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
+    """Continue the run in DIR exactly; of its configuration only --run.* (but for seed, map and
+    num-routes) and --ppo.total-samples may change."""
+    dry_run: bool = False
+    """Build everything, print configuration, size and memory, and stop."""
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Runs the command.
+
+    Args:
+      argv: arguments; those of the process by default.
+
+    Returns:
+      Exit status: 2 after a mistake in what the user gave, said in one line.
+    """
+    try:
+        return run(parse(sys.argv[1:] if argv is None else list(argv)), Console())
+    except (ConfigError, CheckpointError, MapError, RouteError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+
+
+def parse(argv: list[str]) -> Command:
+    """Reads the command line; without a preset in front, this machine's default is meant.
+
+    Args:
+      argv: arguments.
+
+    Returns:
+      The command; with `--resume` its configuration starts from the run's own.
+
+    Raises:
+      ConfigError: `--resume` with a preset, without a run, or with another configuration.
+    """
+    has_preset = bool(argv) and (not argv[0].startswith("-") or argv[0] in ("-h", "--help"))
+    choices = {
+        name: (preset.description, Command(preset.config))
+        for name, preset in presets.PRESETS.items()
+    }
+    command = tyro.extras.overridable_config_cli(
+        choices,
+        args=argv if has_preset else [presets.default_name(), *argv],
+        prog=PROG,
+        description=__doc__,
+        config=(tyro.conf.FlagCreatePairsOff,),
+    )
+    if command.resume is None:
+        return command
+    if has_preset:
+        raise ConfigError(f"--resume {command.resume}: takes no preset: the run has its own values")
+    saved = run_dir.load_config(command.resume)
+    command = tyro.cli(
+        Command,
+        default=Command(saved),
+        args=argv,
+        prog=PROG,
+        config=(tyro.conf.FlagCreatePairsOff,),
+    )
+    _check_same_experiment(saved, command.config)
+    return dataclasses.replace(command, config=_with_run(command.config, dir=command.resume))
+
+
+def run(command: Command, console: Console) -> int:
+    """Does what the command says.
+
+    Args:
+      command: see `parse`.
+      console: where it prints.
+
+    Returns:
+      Exit status.
+    """
+    wanted = command.config
+    path = wanted.run.dir or run_dir.default_path()
+    maps = tuple(file.resolve() for file in wanted.run.maps)
+    wanted = _with_run(wanted, dir=path, maps=maps)
+    if wanted.run.compile_cache is not None:
+        jax.config.update("jax_compilation_cache_dir", str(wanted.run.compile_cache))
+    if command.resume is None:
+        run_dir.check_free(path)
+    made = build.setup(wanted)
+    describe(made, console)
+    if command.dry_run:
+        return 0
+    state = build.initial_state(made)
+    if command.resume is None:
+        run_dir.create(path, wanted)
+    else:
+        state = checkpoint.restore(path, like=state)
+        run_dir.reopen(path, wanted)
+    state = learn.learn(made, state, path, console)
+    if int(state.update) < wanted.ppo.num_updates:
+        console.print(f"stopped; continue with: {PROG} --resume {path}")
+        return 0
+    if wanted.run.eval_routes:
+        score(made, state.params, path, console)
+    console.print(f"run directory: {path}")
+    return 0
+
+
+def score(made: Setup, params: Any, path: Path, console: Console) -> None:
+    """Evaluates the policy on held-out routes; prints the table and writes evaluation.json."""
+    env = build.environment(
+        made.config, made.towns, made.config.run.eval_routes, build.HELD_OUT_SEED
+    )
+    result = evaluate.evaluate(env, made.network, params)
+    console.print(scores.table(result))
+    evaluate.save(result, path / evaluate.FILE)
+
+
+def describe(made: Setup, console: Console) -> None:
+    """Prints what is about to run: every value, the network's size, memory, devices."""
+    for name, part in config.to_json(made.config).items():
+        values = ", ".join(f"{field}={value}" for field, value in part.items())
+        console.print(f"[bold]{name}[/bold]  {values}", highlight=False)
+    names = ", ".join(town.network.name for town in made.towns)
+    num_parameters, estimate = build.estimate_memory(made)
+    ppo = made.config.ppo
+    devices = made.mesh.devices.flat
+    console.print(f"towns       {names}")
+    console.print(f"parameters  {num_parameters:,}")
+    console.print(f"updates     {ppo.num_updates:,} of {ppo.batch_size:,} samples")
+    console.print(f"devices     {made.mesh.size} x {devices[0].device_kind}")
+    console.print("memory of one device, estimated:")
+    for what, size in estimate.parts.items():
+        console.print(f"  {memory.readable(size):>9}  {what}")
+    verdict = "" if estimate.fits else "  [red]more than there is[/red]: set ppo.micro-batch-size"
+    total, available = memory.readable(estimate.total), memory.readable(estimate.available)
+    console.print(f"  {total:>9}  of {available}{verdict}")
+
+
+def _with_run(values: TrainConfig, **changes: Any) -> TrainConfig:
+    return dataclasses.replace(values, run=dataclasses.replace(values.run, **changes))
+
+
+def _check_same_experiment(saved: TrainConfig, asked: TrainConfig) -> None:
+    """Refuses changes that would make a continued run another one."""
+    old, new = config.to_json(saved), config.to_json(asked)
+    for part, fields in old.items():
+        for name, value in fields.items():
+            fixed = name in ("seed", "maps", "num_routes") if part == "run" else True
+            if fixed and name != "total_samples" and new[part][name] != value:
+                raise ConfigError(
+                    f"{part}.{name}: is {value} in the run to be continued, can't become"
+                    f" {new[part][name]}"
+                )
+
+
+if __name__ == "__main__":
+    sys.exit(main())
