@@ -1,0 +1,1 @@
+"""The driving simulator: towns, traffic, the ego, and what it sees."""

@@ -2,7 +2,8 @@
 
 The step after an episode's end ignores its action and returns the first state of a new episode with
 reward 0 and done 0. So the value at that state's predecessor in time is V(final observation), and a
-truncated episode bootstraps without a second raster or forward pass. Learners give that step weight 0.
+truncated episode bootstraps without a second raster or forward pass. Learners give that step weight
+0.
 """
 
 from __future__ import annotations
@@ -18,8 +19,8 @@ from carljax.sim.types import State
 class Env(Protocol):
     """What the rollout asks of an environment: everything unbatched.
 
-    `reset(key)` is `observe(start(key))` and `step(state, action)` is `observe(advance(state, action))`.
-    They are apart so that an autoreset chooses the state first and draws only one image.
+    `reset(key)` is `observe(start(key))` and `step(state, action)` is `observe(advance(state,
+    action))`. They are apart so that an autoreset chooses the state first and draws only one image.
     """
 
     def start(self, key: jax.Array) -> State:

@@ -1,8 +1,8 @@
 """The driving environment: the only file that composes the simulator.
 
-One environment, unbatched; `vmap` goes above. Order of a step: the ego moves by the action, traffic moves by
-its own rules, one far-away car may be used again nearby, the clock of the lights goes on; then the reward
-looks at where everything is now.
+One environment, unbatched; `vmap` goes above. Order of a step: the ego moves by the action, traffic
+moves by its own rules, one far-away car may be used again nearby, the clock of the lights goes on;
+then the reward looks at where everything is now.
 """
 
 from __future__ import annotations
@@ -15,14 +15,14 @@ from flax import struct
 
 from carljax.reward import reward
 from carljax.reward.config import RewardConfig
-from carljax.sim import bicycle, route, situation, spawn, traffic
-from carljax.sim.observation import observe
+from carljax.sim import bicycle, respawn, route, situation, spawn, traffic
 from carljax.sim.bicycle import VehicleParams
 from carljax.sim.idm import IDMParams
+from carljax.sim.observation import observe
 from carljax.sim.rasterizer import RasterConfig
+from carljax.sim.route import Route
 from carljax.sim.scenario import ScenarioBank
 from carljax.sim.types import EgoState, RewardTerms, SimState, Situation, State
-
 
 ACTION_SIZE = 2
 LIGHT_CLOCK = 600.0  # s, the light clock starts anywhere in it
@@ -144,7 +144,7 @@ class DrivingEnv:
             self.idm,
             dt,
         )
-        agents = traffic.respawn(agents, ego, stretch.town, road_map, key_respawn, spawn.CELL)
+        agents = respawn.respawn(agents, ego, stretch.town, road_map, key_respawn, spawn.CELL)
         light_time = before.light_time + dt
         idx = route.advance(stretch, idx, ego.xy)
         seen = self._situation(ego, stretch, first, idx, light_time)
@@ -160,7 +160,8 @@ class DrivingEnv:
             step_count=before.step_count + 1,
             key=key,
         )
-        # A finished route ends for good: there is nothing left to earn, so no value is bootstrapped.
+        # A finished route ends for good: there is nothing left to earn, so no value is
+        # bootstrapped.
         ended = terminated | terms.finished
         truncated = terms.timeout & ~ended
         return State(
@@ -196,7 +197,7 @@ class DrivingEnv:
 
 
 def make_env(bank: ScenarioBank, config: EnvConfig, reward_config: RewardConfig) -> DrivingEnv:
-    """Puts an environment together, with CARLA's saloon as the ego and IDM's city drivers around it."""
+    """Puts an environment together: CARLA's saloon as the ego among IDM's city drivers."""
     return DrivingEnv(
         bank=bank,
         reward_config=reward_config,

@@ -13,7 +13,9 @@ from carljax.sim.types import STOP_LIGHT, STOP_NONE, STOP_SIGN, STOP_YIELD
 # What lane a owes lane b of the same junction.
 FREE, CONFLICT, CONFLICT_YIELD, CONFLICT_PRIORITY = 0, 1, 2, 3
 
-CLEARANCE = 2.6  # m between lane centres at which two cars can't pass. source: ours, car width + 0.7 m
+CLEARANCE = (
+    2.6  # m between lane centres at which two cars can't pass. source: ours, car width + 0.7 m
+)
 TURN_YAW = np.deg2rad(35.0)  # beyond it a lane turns. source: CaRL's route generator, command rule
 
 
@@ -30,7 +32,8 @@ class JunctionTable:
 def build(network: RoadNetwork, table: LaneTable) -> JunctionTable:
     """Finds conflicts between the lanes of each junction.
 
-    Lanes that leave the same lane don't conflict: traffic on them follows one another until they part.
+    Lanes that leave the same lane don't conflict: traffic on them follows one another until they
+    part.
     """
     num_lanes = len(table.length)
     ids = {name: i for i, name in enumerate(sorted({j for j in table.junction if j is not None}))}
@@ -74,7 +77,7 @@ def turn(table: LaneTable, lane: int) -> float:
 def _owes(
     network: RoadNetwork, table: LaneTable, a: int, b: int, priority: set[tuple[str, str]]
 ) -> int:
-    """FREE never: both lanes meet. Signs first, then the file's priorities, then turning left yields."""
+    """Signs come first, then the file's priorities, then whoever crosses oncoming traffic."""
     rank = {STOP_NONE: 0, STOP_LIGHT: 0, STOP_YIELD: 1, STOP_SIGN: 1}
     kind_a, kind_b = rank[int(table.stop_kind[a])], rank[int(table.stop_kind[b])]
     road_a, road_b = (network.lanes[table.members[lane][0]].road_id for lane in (a, b))

@@ -1,4 +1,4 @@
-"""Driving lanes of one town as a table: joined, evenly resampled, with their stop lines. Host only."""
+"""Driving lanes of one town: joined, evenly resampled, with their stop lines. Host only."""
 
 from __future__ import annotations
 
@@ -12,7 +12,9 @@ from carljax.sim.types import STOP_LIGHT, STOP_NONE, STOP_SIGN, STOP_YIELD
 POINT_SPACING = 1.0  # m
 MAX_SUCCESSORS = 4
 LATERAL_ACCEL = 2.5  # m/s^2 in bends. source: ours, a comfortable value for traffic
-DEFAULT_SPEED_LIMIT = 50.0 / 3.6  # m/s, for lanes of files that give none: built-up areas in most of Europe
+DEFAULT_SPEED_LIMIT = (
+    50.0 / 3.6
+)  # m/s, for lanes of files that give none: built-up areas in most of Europe
 MIN_LENGTH = 1e-3  # m
 
 _STOP_KINDS = {"light": STOP_LIGHT, "stop": STOP_SIGN, "yield": STOP_YIELD}

@@ -1,4 +1,4 @@
-"""The light programme of each junction: which lights are green together and in what order. Host only."""
+"""The light programme of each junction: who is green together, in what order. Host only."""
 
 from __future__ import annotations
 
@@ -24,15 +24,17 @@ class LightTable:
 def build(network: RoadNetwork, table: LaneTable) -> LightTable:
     """Orders the controllers of each junction and gives every governed lane its light.
 
-    A light without a controller switches alone. A junction with a single group shows red for one slot, so
-    that its light is not green for ever.
+    A light without a controller switches alone. A junction with a single group shows red for one
+    slot, so that its light is not green for ever.
     """
     controller_of = {s: c.id for c in network.controllers.values() for s in c.signals}
     groups: dict[str, dict[str, list[int]]] = {}
     for lane in np.flatnonzero(table.stop_kind == STOP_LIGHT):
         signal = table.stop_signal[lane]
         group = controller_of.get(signal, f"signal {signal}")
-        groups.setdefault(_junction_of(table, int(lane)), {}).setdefault(group, []).append(int(lane))
+        groups.setdefault(_junction_of(table, int(lane)), {}).setdefault(group, []).append(
+            int(lane)
+        )
     lane_light = np.full(len(table.length), -1)
     cycle, start = [], []
     for number, name in enumerate(sorted(groups)):

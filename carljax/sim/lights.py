@@ -1,8 +1,8 @@
 """Traffic lights as a function of time.
 
-The controllers of a junction are served in turn: each is green, then yellow, then all wait for a moment
-of red before the next one. Times are CARLA's defaults for its traffic lights: green 10 s, yellow 3 s,
-red 2 s. source: CARLA documentation, traffic light defaults.
+The controllers of a junction are served in turn: each is green, then yellow, then all wait for a
+moment of red before the next one. Times are CARLA's defaults for its traffic lights: green 10 s,
+yellow 3 s, red 2 s. source: CARLA documentation, traffic light defaults.
 """
 
 from __future__ import annotations
@@ -38,7 +38,9 @@ def yellow_left(time: jax.Array, start: jax.Array, cycle: jax.Array) -> jax.Arra
     """Seconds of yellow that remain, YELLOW_S before it begins, 0 after.
 
     Args:
-      time, start, cycle: as for `state`.
+      time: as for `state`.
+      start: as for `state`.
+      cycle: as for `state`.
 
     Returns:
       float32 in [0, YELLOW_S].

@@ -23,9 +23,9 @@ LAYER_ROAD, LAYER_SHOULDER, LAYER_MARK_SOLID, LAYER_MARK_BROKEN, LAYER_JUNCTION,
 class RoadMap:
     """Lanes, lights and pixel atlases of M towns.
 
-    All towns share one table of driving lanes; a lane's index says which town it belongs to. Consecutive
-    OpenDRIVE lane sections with a single way on are joined into one lane here. Towns keep their own
-    coordinates, so points of different towns may coincide; lane indices never do.
+    All towns share one table of driving lanes; a lane's index says which town it belongs to.
+    Consecutive OpenDRIVE lane sections with a single way on are joined into one lane here. Towns
+    keep their own coordinates, so points of different towns may coincide; lane indices never do.
 
     Attributes:
       lane_start: (K,) int32, first row of the lane in the point table.
@@ -37,7 +37,8 @@ class RoadMap:
       lane_in_junction: (K,) bool.
       lane_junction: (K,) int32, running index of its junction, -1 outside.
       lane_slot: (K,) int32, place among the lanes of its junction, 0 outside.
-      lane_conflict: (K, J) uint8 over the slots of the same junction: 0 none, CONFLICT, CONFLICT_YIELD.
+      lane_conflict: (K, J) uint8 over the slots of the same junction: 0 none, CONFLICT,
+        CONFLICT_YIELD.
       lane_fork: (K,) int32, equal for lanes that leave the same lane.
       lane_stop_s: (K,) m, where its stop line lies.
       lane_stop_kind: (K,) int32, STOP_*.
@@ -48,9 +49,11 @@ class RoadMap:
       light_cycle: (L,) s, period of the junction's programme.
       light_start: (L,) s, when within it this light turns green.
       layers: (M, H, W) uint8, LAYER_* bits at `PIXELS_PER_METRE`; row = y, column = x.
-      nearest_point: (M, H, W) int32, row in the point table of the nearest driving-lane point, -1 beyond 30 m.
+      nearest_point: (M, H, W) int32, row in the point table of the nearest driving-lane point, -1
+        beyond 30 m.
       origin: (M, 2) m, world position of the centre of pixel [0, 0].
-      spawn_lane: (M, Gy, Gx, C) int32, places for traffic to appear when the ego is in that grid cell; -1 pads.
+      spawn_lane: (M, Gy, Gx, C) int32, places for traffic to appear when the ego is in that grid
+        cell; -1 pads.
       spawn_s: (M, Gy, Gx, C) m.
     """
 

@@ -55,9 +55,7 @@ def _lane_arrays(towns: Sequence[Town]) -> dict[str, np.ndarray]:
             "lane_in_junction": cross.junction >= 0,
             "lane_junction": _shift(cross.junction, first.junction),
             "lane_slot": cross.slot,
-            "lane_conflict": np.pad(
-                cross.conflict, ((0, 0), (0, slots - cross.conflict.shape[1]))
-            ),
+            "lane_conflict": np.pad(cross.conflict, ((0, 0), (0, slots - cross.conflict.shape[1]))),
             "lane_fork": fork,
             "lane_stop_s": table.stop_s,
             "lane_stop_kind": table.stop_kind,

@@ -1,7 +1,8 @@
 """A town as it is read from disk: lanes, links, signals and markings, on the host.
 
 Everything here is float64 NumPy, right-handed metres and radians, before any padding or rounding.
-`opendrive.load` makes a `RoadNetwork`; `road_map.build` turns it into the arrays that live on the device.
+`opendrive.load` makes a `RoadNetwork`; `road_map.build` turns it into the arrays that live on the
+device.
 """
 
 from __future__ import annotations
@@ -42,8 +43,8 @@ class Lane:
       junction: id of the junction the lane belongs to, or None.
       speed_limit: m/s, from the lane's or the road's own speed records, or None.
       successors, predecessors: indices into `RoadNetwork.lanes`, driving lanes only.
-      left, right: index of the neighbour on that side as seen in the direction of travel (driving lanes
-        of the same section), or -1.
+      left, right: index of the neighbour on that side as seen in the direction of travel (driving
+        lanes of the same section), or -1.
       left_is_same_direction, right_is_same_direction: whether that neighbour goes the same way.
     """
 
@@ -90,8 +91,8 @@ class Signal:
       xyz: (3,) float64, where the post stands, m.
       yaw: rad, the direction of the traffic it faces (travel direction of the lanes it governs).
       value: speed limit in m/s for kind "speed", else None.
-      governed: places on driving lanes: the signal's own road and every signalReference, by orientation
-        and validity.
+      governed: places on driving lanes: the signal's own road and every signalReference, by
+        orientation and validity.
     """
 
     id: str

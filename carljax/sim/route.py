@@ -6,7 +6,9 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-WINDOW_BACK = 24  # points kept behind the ego: lights are drawn from 20 behind. source: carl-facts 2.1
+WINDOW_BACK = (
+    24  # points kept behind the ego: lights are drawn from 20 behind. source: carl-facts 2.1
+)
 WINDOW_AHEAD = 152  # points kept ahead: 150 are drawn. source: carl-facts 2.1
 WINDOW = WINDOW_BACK + WINDOW_AHEAD
 LOOK_AHEAD = 6  # the current point and the next five. source: carl-facts 4.3, route deviation
@@ -22,14 +24,15 @@ class Route:
       s: (R,) m, arc length.
       lane: (R,) int32, row in the lane table.
       lane_s: (R,) m, arc length on that lane.
-      speed_limit: (R,) m/s in force at the point (last sign passed; 30 km/h at the start where the town has
-        signs. source: paper, Soft Penalties).
+      speed_limit: (R,) m/s in force at the point (last sign passed; 30 km/h at the start where the
+        town has signs. source: paper, Soft Penalties).
       in_junction: (R,) bool.
       num_points: () int32.
       length: () m, of the whole route.
       town: () int32.
       stop_idx: (Q,) int32, route index of each stop line.
-      stop_xy: (Q, 2) m, its centre; stop_yaw: (Q,) rad, direction of travel; stop_s: (Q,) m on the route.
+      stop_xy: (Q, 2) m, its centre; stop_yaw: (Q,) rad, direction of travel; stop_s: (Q,) m on the
+        route.
       stop_kind: (Q,) int32, STOP_*; STOP_NONE pads.
       stop_light: (Q,) int32, row in the light table or -1.
       stop_width: (Q,) m, lane width there.
@@ -83,9 +86,7 @@ def window(routes: Route, scenario_idx: jax.Array, route_idx: jax.Array) -> tupl
         begin = (scenario_idx, start, *[0] * (rows.ndim - 2))
         return jax.lax.dynamic_slice(rows, begin, (1, WINDOW, *rows.shape[2:]))[0]
 
-    whole = jax.tree.map(
-        lambda x: x[scenario_idx], routes.replace(**dict.fromkeys(_POINT_FIELDS))
-    )
+    whole = jax.tree.map(lambda x: x[scenario_idx], routes.replace(**dict.fromkeys(_POINT_FIELDS)))
     part = {name: stretch(getattr(routes, name)) for name in _POINT_FIELDS}
     # Padding stays negative, so that it is never taken for a point of the window.
     far = jnp.int32(-(1 << 20))
@@ -103,8 +104,8 @@ def window(routes: Route, scenario_idx: jax.Array, route_idx: jax.Array) -> tupl
 def advance(route: Route, route_idx: jax.Array, xy: jax.Array) -> jax.Array:
     """The last passed point after a move.
 
-    A point is passed once the ego is ahead of it; only the next two are looked at, which credits at most
-    2 m a step. source: carl-facts 4.2.
+    A point is passed once the ego is ahead of it; only the next two are looked at, which credits at
+    most 2 m a step. source: carl-facts 4.2.
 
     Args:
       route: a route or a window of one.

@@ -1,8 +1,8 @@
 """Random routes through a town's lane graph. Host only.
 
-A route starts at a random lane, goes forward in steps of 1 m, chooses uniformly at branches and changes
-lane with 10 % probability per metre outside junctions, at most once in 200 m. source: paper, Scenario
-Generation, and the authors' generator.
+A route starts at a random lane, goes forward in steps of 1 m, chooses uniformly at branches and
+changes lane with 10 % probability per metre outside junctions, at most once in 200 m. source:
+paper, Scenario Generation, and the authors' generator.
 """
 
 from __future__ import annotations
@@ -208,7 +208,8 @@ def _assemble(
         stop_width=pad(pose[stops, 3], sizes.num_stops, 0.0).astype(np.float32),
         sign_xy=pad(
             np.array([town.network.signals[i].xyz[:2] for _, i in signs]).reshape(-1, 2),
-            sizes.num_signs, 0.0,
+            sizes.num_signs,
+            0.0,
         ).astype(np.float32),
         sign_idx=pad(np.array([at for at, _ in signs], int), sizes.num_signs, -1).astype(np.int32),
         sign_limit=pad(

@@ -55,7 +55,10 @@ class ScenarioBank:
 
 
 def make_bank(
-    towns: Sequence[Town], num_scenarios: int, num_agents: int, seed: int,
+    towns: Sequence[Town],
+    num_scenarios: int,
+    num_agents: int,
+    seed: int,
     route_length: float = 1000.0,
 ) -> ScenarioBank:
     """Draws scenarios, the same number in every town (as evenly as it goes).
@@ -82,9 +85,7 @@ def make_bank(
         rng = np.random.default_rng([seed, number])
         route = route_generator.draw(towns[town], firsts[town], route_length, sizes, rng)
         routes.append(route)
-        agents.append(
-            _traffic(towns[town], found[town], firsts[town].lane, route, num_agents, rng)
-        )
+        agents.append(_traffic(towns[town], found[town], firsts[town].lane, route, num_agents, rng))
     lane, s, speed = (np.stack(values) for values in zip(*agents, strict=True))
     return ScenarioBank(
         road_map=road_map_builder.build(towns),
@@ -96,7 +97,11 @@ def make_bank(
 
 
 def _traffic(
-    town: Town, found: spawn.Places, first_lane: int, route: Route, num_agents: int,
+    town: Town,
+    found: spawn.Places,
+    first_lane: int,
+    route: Route,
+    num_agents: int,
     rng: np.random.Generator,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Where traffic stands at the start: lane (N,), s (N,) m, speed (N,) m/s."""

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 
 from carljax.sim import geometry, lights, route
+from carljax.sim.right_of_way import EgoPlace
 from carljax.sim.road_map import (
     LAYER_PARKING,
     LAYER_ROAD,
@@ -15,7 +16,6 @@ from carljax.sim.road_map import (
     nearest_lane,
 )
 from carljax.sim.route import Route
-from carljax.sim.traffic import EgoPlace
 from carljax.sim.types import LIGHT_GREEN, STOP_LIGHT, EgoState, Situation
 
 # Sample points along and across the ego's footprint, 0.6 m apart: the atlas resolves 0.5 m.
@@ -98,10 +98,8 @@ def off_road_frac(
     return 1.0 - drivable.mean(dtype=jnp.float32)
 
 
-def ego_place(
-    ego: EgoState, road_map: RoadMap, stretch: Route, stretch_idx: jax.Array
-) -> EgoPlace:
-    """Where traffic takes the ego to be: on its route's lane when it is near, else on the nearest lane."""
+def ego_place(ego: EgoState, road_map: RoadMap, stretch: Route, stretch_idx: jax.Array) -> EgoPlace:
+    """Where traffic takes the ego to be: on its route's lane when near it, else the nearest."""
     nearest = nearest_lane(road_map, stretch.town, ego.xy)
     on_route = route.distance(stretch, stretch_idx, ego.xy) < ON_ROUTE
     offset = geometry.to_frame(ego.xy, stretch.xy[stretch_idx], stretch.yaw[stretch_idx])
@@ -109,6 +107,4 @@ def ego_place(
     s = jnp.where(on_route, stretch.lane_s[stretch_idx] + offset[0], nearest.s)
     ahead = jnp.minimum(stretch_idx + JUNCTION_LOOK_AHEAD, stretch.num_points - 1)
     coming = stretch.lane[ahead]
-    return EgoPlace(
-        lane=lane, next_lane=jnp.where(on_route & (coming != lane), coming, -1), s=s
-    )
+    return EgoPlace(lane=lane, next_lane=jnp.where(on_route & (coming != lane), coming, -1), s=s)

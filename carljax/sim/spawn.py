@@ -1,4 +1,4 @@
-"""Places where traffic may appear: at the start of an episode and, later, out of the ego's sight. Host only."""
+"""Places where traffic may appear, at the start and later out of the ego's sight. Host only."""
 
 from __future__ import annotations
 

@@ -1,8 +1,9 @@
 """The structs of the simulator: frozen pytrees, unbatched; `vmap` adds batch axes in front.
 
-Axes: T time, B environments, N agents, M towns, K lanes, P lane points, S scenarios, R route points,
-Q stop lines of a route, G speed signs of a route, D history steps. SI units and radians; float32 where
-no dtype is written. Frames are right-handed: x east, y north, yaw counter-clockwise in [-pi, pi).
+Axes: T time, B environments, N agents, M towns, K lanes, P lane points, S scenarios, R route
+points, Q stop lines of a route, G speed signs of a route, D history steps. SI units and radians;
+float32 where no dtype is written. Frames are right-handed: x east, y north, yaw counter-clockwise
+in [-pi, pi).
 """
 
 from __future__ import annotations
@@ -16,8 +17,9 @@ KIND_NONE, KIND_VEHICLE, KIND_PEDESTRIAN, KIND_STATIC = 0, 1, 2, 3
 STOP_NONE, STOP_LIGHT, STOP_SIGN, STOP_YIELD = 0, 1, 2, 3
 LIGHT_GREEN, LIGHT_YELLOW, LIGHT_RED = 0, 1, 2
 
-# A stop sign holds on the lane's last metres before its line; to halt is to halt with the box of the
-# ego over that strip. source: ours; CARLA's trigger boxes are as wide as the lane and a few metres long.
+# A stop sign holds on the lane's last metres before its line; to halt is to halt with the box of
+# the ego over that strip. source: ours; CARLA's trigger boxes are as wide as the lane and a few
+# metres long.
 STOP_BOX_LENGTH = 3.0
 
 
@@ -93,7 +95,7 @@ class Agents:
 
 @struct.dataclass
 class Situation:
-    """Where the ego is on the road and the route after a step: what reward and observation look up once.
+    """Where the ego is on road and route after a step, looked up once for all who ask.
 
     Attributes:
       lane_lateral: () m, offset from the nearest driving lane's centre, positive to its left.

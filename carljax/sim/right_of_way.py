@@ -1,0 +1,167 @@
+"""Right of way: stop lines, lights, stop signs, and who enters a junction first."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+from carljax.sim import lights
+from carljax.sim.junctions import CONFLICT, CONFLICT_YIELD, FREE
+from carljax.sim.road_map import RoadMap
+from carljax.sim.types import LIGHT_GREEN, LIGHT_RED, STOP_LIGHT, STOP_SIGN, Agents, EgoState
+
+BRAKING = 3.0  # m/s^2 at which a driver still stops for yellow. source: ours, a firm stop
+GATE_RANGE = 40.0  # m before a junction at which others are looked at. source: ours
+GAP_TIME = 4.0  # s of gap taken in traffic that has priority. source: HCM critical gaps, 4 to 7 s
+PATIENCE = (
+    8.0  # s at rest after which nobody waits for a car that doesn't move itself. source: ours
+)
+
+
+@struct.dataclass
+class Mover:
+    """What others see of a car: agents and, as the last row, the ego; all (N + 1,).
+
+    Attributes:
+      lane, next_lane: int32 rows of the lane table; -1 where there is none.
+      s: m along its lane.
+      entry: m from its front bumper to the end of its lane.
+      speed: m/s.
+      half_length: m.
+      can_go: bool, no red light or unmet stop sign keeps it from `next_lane`.
+    """
+
+    lane: jax.Array
+    next_lane: jax.Array
+    s: jax.Array
+    entry: jax.Array
+    speed: jax.Array
+    half_length: jax.Array
+    can_go: jax.Array
+
+
+@struct.dataclass
+class EgoPlace:
+    """Where the ego is on the lane graph: lane, next_lane () int32 (-1 unknown), s () m."""
+
+    lane: jax.Array
+    next_lane: jax.Array
+    s: jax.Array
+
+
+@struct.dataclass
+class StopAhead:
+    """The next stop line of each agent, (N,).
+
+    Attributes:
+      distance: m from its front bumper.
+      kind: int32 STOP_*.
+      light: int32 LIGHT_*, LIGHT_GREEN where there is no light.
+    """
+
+    distance: jax.Array
+    kind: jax.Array
+    light: jax.Array
+
+
+def planned_lane(agents: Agents, number: int) -> jax.Array:
+    """A lane of the plan, the current one where the plan has ended."""
+    lane = agents.lanes[:, number]
+    return jnp.where(lane >= 0, lane, jnp.maximum(agents.lanes[:, 0], 0))
+
+
+def all_movers(
+    agents: Agents,
+    stop: StopAhead,
+    ego: EgoState,
+    ego_length: jax.Array,
+    ego_place: EgoPlace,
+    road_map: RoadMap,
+) -> Mover:
+    """Lists what drivers see of one another: the agents and, last, the ego."""
+    lane = planned_lane(agents, 0)
+    valid = agents.valid
+    half = 0.5 * agents.length
+    ego_half = 0.5 * ego_length
+    ego_left = road_map.lane_length[jnp.maximum(ego_place.lane, 0)] - ego_place.s
+    held = must_stop(agents, stop)
+
+    def with_ego(values: jax.Array, of_ego: jax.Array) -> jax.Array:
+        return jnp.append(values, of_ego.astype(values.dtype))
+
+    return Mover(
+        lane=with_ego(jnp.where(valid, agents.lanes[:, 0], -1), ego_place.lane),
+        next_lane=with_ego(jnp.where(valid, agents.lanes[:, 1], -1), ego_place.next_lane),
+        s=with_ego(agents.lane_s, ego_place.s),
+        entry=with_ego(road_map.lane_length[lane] - agents.lane_s - half, ego_left - ego_half),
+        speed=with_ego(agents.speed, ego.speed),
+        half_length=with_ego(half, ego_half),
+        can_go=with_ego(~held, jnp.ones((), bool)),
+    )
+
+
+def stop_ahead(agents: Agents, road_map: RoadMap, light_time: jax.Array) -> StopAhead:
+    """The stop line on the lane an agent is on or on the one it will take next."""
+    lane, following = planned_lane(agents, 0), planned_lane(agents, 1)
+    front = agents.lane_s + 0.5 * agents.length
+    here = road_map.lane_stop_s[lane] - front
+    there = road_map.lane_length[lane] + road_map.lane_stop_s[following] - front
+    ahead = (road_map.lane_stop_kind[lane] > 0) & (here > -0.5)
+    kind_there = jnp.where(agents.lanes[:, 1] >= 0, road_map.lane_stop_kind[following], 0)
+    governing = jnp.where(ahead, lane, following)
+    light = jnp.maximum(road_map.lane_light[governing], 0)
+    colour = lights.state(light_time, road_map.light_start[light], road_map.light_cycle[light])
+    return StopAhead(
+        distance=jnp.where(ahead, here, there),
+        kind=jnp.where(ahead, road_map.lane_stop_kind[lane], kind_there),
+        light=jnp.where(road_map.lane_light[governing] >= 0, colour, LIGHT_GREEN),
+    )
+
+
+def must_stop(agents: Agents, stop: StopAhead) -> jax.Array:
+    """(N,) bool: a red light, a yellow one with room to stop, or a stop sign not yet honoured."""
+    room = stop.distance > agents.speed**2 / (2 * BRAKING)
+    not_green = (stop.light == LIGHT_RED) | ((stop.light != LIGHT_GREEN) & room)
+    red = (stop.kind == STOP_LIGHT) & not_green
+    sign = (stop.kind == STOP_SIGN) & ~agents.has_stopped
+    return (red | sign) & (stop.distance > -0.5)
+
+
+def has_stopped(agents: Agents, stop: StopAhead, speed: jax.Array) -> jax.Array:
+    """(N,) bool: halted at the sign ahead; forgotten once the line is passed."""
+    near = (stop.kind == STOP_SIGN) & (stop.distance < 4.0)
+    return near & (agents.has_stopped | (speed < 0.2))
+
+
+def gated(agents: Agents, movers: Mover, road_map: RoadMap) -> jax.Array:
+    """(N,) bool: others go first into the junction that an agent is about to enter.
+
+    Nobody enters while a conflicting lane is occupied. Whoever has priority and is near goes first;
+    among equals, whoever arrives first.
+    """
+    following = planned_lane(agents, 1)
+    entry = movers.entry[:-1]
+    enters = road_map.lane_in_junction[following] & (agents.lanes[:, 1] >= 0)
+    enters &= (entry > -1.0) & (entry < GATE_RANGE)
+    owes_inside = _owes(following, movers.lane, road_map)
+    owes = _owes(following, movers.next_lane, road_map)
+    arrival = jnp.maximum(movers.entry, 0.0) / jnp.maximum(movers.speed, 2.0)
+    coming = movers.can_go & (arrival < GAP_TIME) & (movers.entry > -1.0)
+    order = jnp.arange(movers.lane.shape[0])
+    mine, mine_order = arrival[:-1, None], order[:-1, None]
+    earlier = (arrival[None, :] < mine) | ((arrival[None, :] == mine) & (order < mine_order))
+    # Two that wait for one another would wait for ever.
+    stuck = (agents.wait_s > PATIENCE)[:, None] & (movers.speed < 0.5)[None, :]
+    waits = (owes == CONFLICT_YIELD) | ((owes == CONFLICT) & earlier)
+    waits &= coming[None, :] & ~stuck
+    return enters & ((owes_inside != FREE) | waits).any(axis=1)
+
+
+def _owes(lane: jax.Array, other: jax.Array, road_map: RoadMap) -> jax.Array:
+    """(N, N + 1) uint8: what each agent's lane owes the lane of every other car."""
+    seen = jnp.maximum(other, 0)
+    same = road_map.lane_junction[lane][:, None] == road_map.lane_junction[seen][None, :]
+    same &= (other >= 0)[None, :] & road_map.lane_in_junction[lane][:, None]
+    owes = road_map.lane_conflict[lane[:, None], road_map.lane_slot[seen][None, :]]
+    return jnp.where(same, owes, jnp.uint8(FREE))
