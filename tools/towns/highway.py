@@ -33,14 +33,14 @@ HALF_X, HALF_Y = 250.0, 125.0
 RADIUS, EASING = 80.0, 40.0
 MEDIAN, SHOULDER = 1.5, 2.0
 BEND_SPEED, INTERCHANGE_SPEED, STRAIGHT_SPEED = 60.0, 80.0, 100.0
-RAMP_SPEED, LOCAL_SPEED = 50.0, 50.0
+RAMP_SPEED, LOCAL_SPEED = 40.0, 50.0
 # The third lane reaches this far to either side of the middle; its ramps take so much more, m.
 THIRD_LANE, RAMP_ZONE = 50.0, 60.0
 # Where a ramp meets its zone: further out than the third lane (m), at this angle (rad).
 RAMP_ASIDE, RAMP_ANGLE = 3.0, 0.1
 # Crossings of highway and local road: from the middle to the arms of either, m.
 HIGHWAY_ROOM, CROSSING_ROOM, LOCAL_ROOM = 13.0, 17.0, 13.0
-SOUTH_ROAD_Y, RAMP_X = -190.0, 155.0
+SOUTH_ROAD_Y, RAMP_X, BULGE = -190.0, 155.0, 48.0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -115,9 +115,8 @@ def _rounded(start: Pose, goal: Pose) -> Path:
 
 
 def _local(walk: bool) -> Section:
-    side = (lane("driving", LANE_WIDTH, SOLID), lane("shoulder", 1.5))
-    if walk:
-        side = (lane("driving", LANE_WIDTH, SOLID), lane("shoulder", 1.0), lane("sidewalk", 2.0))
+    edge = (lane("shoulder", 1.0), lane("sidewalk", 2.0)) if walk else (lane("shoulder", 1.5),)
+    side = (lane("driving", LANE_WIDTH, SOLID), *edge)
     return Section(0.0, side, side, YELLOW if walk else CENTRE_BROKEN)
 
 
@@ -128,7 +127,7 @@ def _add_outer_road(town: Town) -> list[Road]:
     paths = (
         geometry.wind(
             Pose(-out, 0.0, math.pi),
-            Pose(-out - 40.0, -75.0, -math.pi / 2),
+            Pose(-out - BULGE, -90.0, -math.pi / 2),
             Pose(-stop, SOUTH_ROAD_Y, 0.0),
         ),
         geometry.wind(
@@ -138,7 +137,7 @@ def _add_outer_road(town: Town) -> list[Road]:
         ),
         geometry.wind(
             Pose(stop, SOUTH_ROAD_Y, 0.0),
-            Pose(out + 40.0, -75.0, math.pi / 2),
+            Pose(out + BULGE, -90.0, math.pi / 2),
             Pose(out, 0.0, math.pi),
         ),
     )

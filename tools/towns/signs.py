@@ -115,7 +115,7 @@ def add_crosswalk(town: Town, arm: Arm, connections: list[Connection]) -> None:
         sum(each.width for each in arm.lanes(incoming) if each.spec.kind != "sidewalk")
         for incoming in (True, False)
     ]
-    # The object lies in the frame of the connecting road's first point, which looks as the arm does.
+    # The object lies in the frame of the connecting road's start, which looks as the arm does.
     _, left, _ = start.seen_from(arm.pose)
     corners = [
         (CROSSWALK_FROM, -widths[0] - left),

@@ -25,7 +25,7 @@ from towns.plan import (
 STREET_SPEED, ROAD_SPEED = 30.0, 50.0
 # From the middle of a junction to its arms, m.
 ROOM = 13.0
-# Roundabout: lane centre radius, lane width, distance of the arms, half the angle that an arm takes.
+# Roundabout: lane centre radius, lane width, distance of the arms, half the angle of an arm.
 RING_RADIUS, RING_WIDTH, RING_ROOM, RING_HALF = 15.0, 4.5, 27.0, math.radians(30.0)
 NARROW, PARKING = 2.9, 2.2
 
@@ -74,13 +74,13 @@ def build() -> Town:
         ("Cn", "Ns", [], "street"),
         ("Cw", "We", [], "street"),
         ("Cs", "Sn", [], "street"),
-        ("Ne", "En", [(70, 165, -5), (135, 120, -55)], "road"),
+        ("Ne", "En", [(70, 162, -3), (138, 112, -65)], "road"),
         ("Wn", "Nw", [(-140, 70, 65), (-90, 125, 30)], "parking"),
         ("Sw", "Ws", [(-70, -120, 165), (-125, -85, 125)], "narrow"),
         ("Se", "Fw", [(95, -150, 0)], "street"),
         ("Fn", "Es", [], "street"),
-        ("Ee", "Fe", [(215, 35, 10), (270, -30, -85), (235, -115, -150)], "road"),
-        ("Ss", "Ww", [(-20, -200, 200), (-120, -190, 170), (-205, -110, 100)], "road"),
+        ("Ee", "Fe", [(210, 32, 0), (275, -45, -90), (230, -118, -160)], "road"),
+        ("Ss", "Ww", [(-40, -215, 185), (-130, -190, 155), (-216, -95, 95)], "road"),
     ):
         _add_link(town, arms, (start, goal), [_pose(*each) for each in via], kind)
     for name, node in NODES.items():
@@ -127,8 +127,8 @@ def _hill(start: float, middle: float, end: float, length: float) -> tuple[Cubic
 
 def _sections(kind: str, length: float) -> list[Section]:
     if kind == "road":
-        side = (lane("driving", LANE_WIDTH, SOLID), lane("shoulder", 1.5))
-        return [Section(0.0, side, side, CENTRE_BROKEN)]
+        rural = (lane("driving", LANE_WIDTH, SOLID), lane("shoulder", 1.5))
+        return [Section(0.0, rural, rural, CENTRE_BROKEN)]
     walk = (lane("shoulder", 1.0), lane("sidewalk", 2.0))
     plain = (lane("driving", LANE_WIDTH, SOLID), *walk)
     if kind == "narrow":
@@ -183,7 +183,7 @@ def _add_crossing(town: Town, node: Node, at: dict[str, Arm]) -> None:
 
 
 def _add_roundabout(town: Town, node: Node, at: dict[str, Arm]) -> None:
-    """A ring of one-way roads; a junction at every arm joins the ring, the way in and the way out."""
+    """A ring of one-way roads; a junction at every arm joins it with the ways in and out."""
     names = sorted(at, key=lambda name: node.directions[name])
     ring = [
         _ring_road(town, node, node.directions[a], node.directions[b])

@@ -10,9 +10,11 @@ from towns import geometry, signs
 from towns.plan import Junction, Mark, Road, Section, Town
 
 REVISION = ("1", "6")
-# Decimals in the file: 1 um for places, and directions and curvatures to match over 100 m.
-DECIMALS, FINE_DECIMALS = 6, 10
-FINE = {"hdg", "curvature", "curvStart", "curvEnd", "c", "d"}
+# Plain metres around a point of no meaning: readers that want a projection get one.
+GEO_REFERENCE = "+proj=tmerc +lat_0=0 +lon_0=0 +k=1 +x_0=0 +y_0=0 +datum=WGS84 +units=m +no_defs"
+# Decimals in the file: 1 um for places, and as much for all that is multiplied by up to 500 m.
+DECIMALS = 6
+FINE = {"hdg": 10, "curvature": 10, "curvStart": 10, "curvEnd": 10, "b": 10, "c": 12, "d": 15}
 VERBATIM = {"name", "date", "vendor", "type", "rule", "id"}
 CONTACTS = {"start": xodr.ContactPoint.start, "end": xodr.ContactPoint.end}
 ELEMENTS = {"road": xodr.ElementType.road, "junction": xodr.ElementType.junction}
@@ -21,7 +23,7 @@ ORIENTATIONS = {"+": xodr.Orientation.positive, "-": xodr.Orientation.negative}
 
 def to_text(town: Town) -> str:
     """The file's text, the same on every call: no date, numbers rounded."""
-    drive = xodr.OpenDrive(town.name, *REVISION)
+    drive = xodr.OpenDrive(town.name, *REVISION, GEO_REFERENCE)
     for road in town.roads:
         drive.add_road(_road(road))
     for junction in town.junctions:
@@ -192,7 +194,7 @@ def _tidy(parent: ET.Element) -> None:
         parent.attrib.pop(key, None)
     for key, value in parent.attrib.items():
         if key not in VERBATIM:
-            parent.attrib[key] = _rounded(value, FINE_DECIMALS if key in FINE else DECIMALS)
+            parent.attrib[key] = _rounded(value, FINE.get(key, DECIMALS))
 
 
 def _rounded(value: str, decimals: int) -> str:
