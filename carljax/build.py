@@ -21,9 +21,6 @@ from carljax.sim import scenario, town, towns
 from carljax.sim.env import DrivingEnv, make_env
 from carljax.sim.town import Town
 
-# Routes for scoring come from a seed that no training run may use, so that none is trained on.
-HELD_OUT_SEED = 1_000_000_007
-
 
 @dataclasses.dataclass(frozen=True)
 class Setup:
@@ -83,7 +80,7 @@ def environment(
       config: the run's configuration.
       loaded: the towns.
       num_routes: over all towns.
-      seed: of routes and first places of traffic; `HELD_OUT_SEED` for scoring.
+      seed: of routes and first places of traffic; `config.HELD_OUT_SEED` for scoring.
 
     Returns:
       The environment.

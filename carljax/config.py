@@ -22,6 +22,9 @@ from carljax.ppo.config import NetworkConfig, PPOConfig
 from carljax.reward.config import RewardConfig
 from carljax.sim.env import EnvConfig
 
+# Seed of the routes for scoring; no training run may use it.
+HELD_OUT_SEED = 1_000_000_007
+
 
 class ConfigError(ValueError):
     """A configuration that can't be used: one line that names file, field and reason."""
@@ -74,6 +77,8 @@ class RunConfig:
                 raise ConfigError(
                     f"run.{name}: {getattr(self, name)} is below the least allowed, {minimum}"
                 )
+        if self.seed == HELD_OUT_SEED:
+            raise ConfigError(f"run.seed: {self.seed} is the seed of the held-out routes")
 
 
 @dataclasses.dataclass(frozen=True)

@@ -23,7 +23,7 @@ from rich.console import Console
 
 from carljax import atomic, build, checkpoint, drive, machine, run_dir
 from carljax.checkpoint import CheckpointError
-from carljax.config import ConfigError, TrainConfig
+from carljax.config import HELD_OUT_SEED, ConfigError, TrainConfig
 from carljax.ppo import trainer
 from carljax.ppo.networks import ActorCritic
 from carljax.render import gif
@@ -186,7 +186,7 @@ def run(command: Command, console: Console) -> int:
     path, update = run_dir.split_checkpoint(command.checkpoint)
     config = run_dir.load_config(path)
     towns = build.load_towns(command.maps or config.run.maps)
-    env = build.environment(config, towns, command.num_routes, build.HELD_OUT_SEED)
+    env = build.environment(config, towns, command.num_routes, HELD_OUT_SEED)
     network = ActorCritic(config.network)
     params, update = _load_params(command, path, update, config, env)
     result = evaluate(env, network, params, [town.network.name for town in towns])

@@ -15,7 +15,7 @@ from rich.console import Console
 from carljax import build, checkpoint, config, evaluate, learn, memory, presets, run_dir, scores
 from carljax.build import Setup
 from carljax.checkpoint import CheckpointError
-from carljax.config import ConfigError, TrainConfig
+from carljax.config import HELD_OUT_SEED, ConfigError, TrainConfig
 from carljax.sim.road_network import MapError
 from carljax.sim.route_generator import RouteError
 
@@ -130,9 +130,7 @@ def run(command: Command, console: Console) -> int:
 
 def score(made: Setup, params: Any, path: Path, console: Console) -> None:
     """Evaluates the policy on held-out routes; prints the table and writes evaluation.json."""
-    env = build.environment(
-        made.config, made.towns, made.config.run.eval_routes, build.HELD_OUT_SEED
-    )
+    env = build.environment(made.config, made.towns, made.config.run.eval_routes, HELD_OUT_SEED)
     result = evaluate.evaluate(env, made.network, params)
     console.print(scores.table(result))
     evaluate.save(result, path / evaluate.FILE)

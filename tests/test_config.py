@@ -116,6 +116,11 @@ def test_counts_of_nothing_are_refused(field):
         dataclasses.replace(RunConfig(), **{field: 0}).validate()
 
 
+def test_the_seed_of_the_held_out_routes_is_refused():
+    with pytest.raises(ConfigError, match=r"run\.seed: .* held-out"):
+        RunConfig(seed=config.HELD_OUT_SEED).validate()
+
+
 def test_the_papers_preset_has_the_papers_values():
     # CaRL paper, table of PPO hyperparameters, column CaRL (CARLA)
     ppo = presets.PRESETS["carl-carla"].config.ppo
