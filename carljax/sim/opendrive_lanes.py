@@ -305,7 +305,7 @@ def _marks(spec: LaneSpec, section: SectionSpec, at: Sampled) -> list[RoadMark]:
         s = np.concatenate([[start], inside, [stop]])
         xy = at.line(at.border[spec.id])
         xy = np.column_stack([np.interp(s, at.s, xy[:, i]) for i in (0, 1)])
-        out.append(RoadMark(xy, mark.kind, mark.colour))
+        out.append(RoadMark(xy, mark.kind, mark.colour, np.interp(s, at.s, at.z)))
     return out
 
 

@@ -70,6 +70,19 @@ def _box(element: ET.Element, road: RoadSpec, place: Place) -> np.ndarray:
     return _open(origin + corners @ turn.T)
 
 
+def _is_area(outline: ET.Element) -> bool:
+    """Whether a crosswalk's outline encloses an area.
+
+    In OpenDRIVE 1.4 every outline does. Since 1.5 (<outlines>) it can also be a line: closed="true",
+    a fill or a repeated first corner make it an area. CARLA 0.9.16 reads none of the later kind.
+    """
+    if outline.get("closed") is not None:
+        return outline.get("closed") in ("true", "1")
+    corners = [tuple(sorted(c.attrib.items())) for c in outline if c.tag.startswith("corner")]
+    places = [tuple(kv for kv in c if kv[0] in ("u", "v", "s", "t")) for c in corners]
+    return outline.get("fillType") is not None or (len(places) > 2 and places[0] == places[-1])
+
+
 def crosswalks(road: RoadSpec, warnings: Warnings) -> list[np.ndarray]:
     """Polygons (P, 3) of the road's crosswalks, not closed."""
     out = []
@@ -79,10 +92,14 @@ def crosswalks(road: RoadSpec, warnings: Warnings) -> list[np.ndarray]:
         place = road.place.at("object", element.get("id", "?"))
         if element.find("repeat") is not None:
             warnings.add("repeat of a crosswalk is not read", place)
-        outlines = element.findall("outline") + element.findall("outlines/outline")
-        outlines = [o for o in outlines if o.get("outer", "true") != "false"]
-        polygons = [_outline(o, element, road, place) for o in outlines]
-        polygons = polygons or [_box(element, road, place)]
+        simple, later = element.findall("outline"), element.findall("outlines/outline")
+        areas = simple + [o for o in later if _is_area(o)]
+        if len(areas) < len(simple) + len(later):
+            warnings.add('crosswalk outline that is not closed="true": left out', place)
+        areas = [o for o in areas if o.get("outer", "true") != "false"]
+        polygons = [_outline(o, element, road, place) for o in areas]
+        if not simple and not later:
+            polygons = [_box(element, road, place)]
         good = [p for p in polygons if len(p) >= 3]
         if len(good) < len(polygons):
             warnings.add("crosswalk with fewer than three corners: left out", place)

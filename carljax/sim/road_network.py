@@ -22,11 +22,13 @@ class RoadMark:
       xy: (P, 2) float64, the line's points in the world frame, m.
       kind: MARK_BROKEN or MARK_SOLID (lines without paint are left out).
       colour: "white", "yellow", ...
+      z: (P,) float64, its heights, m; empty where everything is flat.
     """
 
     xy: np.ndarray
     kind: int
     colour: str
+    z: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(0))
 
 
 @dataclasses.dataclass(frozen=True)
