@@ -20,12 +20,11 @@ def default_path() -> Path:
     return Path("runs") / datetime.datetime.now().strftime("%Y%m%d-%H%M%S")
 
 
-def create(path: Path, train_config: TrainConfig) -> None:
-    """Makes a directory for a new run and writes what it is run with.
+def check_free(path: Path) -> None:
+    """Refuses a directory in which a new run can't be made.
 
     Args:
-      path: a directory without a run; it need not exist.
-      train_config: saved in it.
+      path: a directory that need not exist.
 
     Raises:
       ConfigError: it holds a run already, or is no directory.
@@ -37,6 +36,15 @@ def create(path: Path, train_config: TrainConfig) -> None:
             f"{path}: holds a run already; continue it with --resume {path}"
             " or choose another --run.dir"
         )
+
+
+def create(path: Path, train_config: TrainConfig) -> None:
+    """Makes a directory for a new run and writes what it is run with.
+
+    Args:
+      path: see `check_free`.
+      train_config: saved in it.
+    """
     config.save(train_config, path / CONFIG_FILE)
     _note_start(path, train_config)
 
