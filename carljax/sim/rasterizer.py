@@ -43,7 +43,7 @@ from carljax.sim.types import (
     EgoState,
 )
 
-# source: carl-facts 2.1, order of the channels
+# source: the authors' code, CARLA bird's-eye view
 CHANNELS = (
     "road",
     "route",
@@ -59,7 +59,7 @@ CHANNELS = (
 NUM_CHANNELS = len(CHANNELS)
 LIGHTS, STOP, SPEED_SIGNS = 5, 6, 7
 
-# source: carl-facts 2.1
+# source: the authors' code
 SOLID_VALUE, BROKEN_VALUE = 255, 127
 GREEN_VALUE, YELLOW_DIP, YELLOW_RAMP = 80, 0.33, 3.0  # byte, fraction of 255, s
 LIGHTS_BEHIND, LIGHTS_AHEAD = 20, 150  # route points of about 1 m
@@ -68,12 +68,12 @@ ROUTE_RADIUS = 1.5  # m: 3 px at 2 px/m
 STOP_LINE_THICKNESS, STOP_LINE_FRAC = 1.5, 0.8  # m: 3 px at 2 px/m; of the lane's width
 SPEED_SIGN_SIDE = 2.0  # m
 HEIGHT_REACH = 8.0  # m, road users farther above or below are not drawn
-# source: carl-facts 2.2
+# source: the authors' code, speed coding
 SPEED_OFFSET, SPEED_RANGE = 2.67, 36.0  # m/s
 FORECAST_S, FORECAST_MIN = 1.0, 0.5  # s, m
 HALF_EXTENT_MIN = 0.8  # m
 BRAKE_LIGHT_VALUE, BRAKE_LIGHT_X, BRAKE_LIGHT_SIDE = 111, -1.5, 1.0  # byte, m, m
-# source: carl-facts 4.3: looked for 20 m ahead, and it holds until the car's rear is over it
+# source: the authors' code looks for it 20 m ahead; ours: it holds until the car's rear is over it
 STOP_SIGN_BEHIND, STOP_SIGN_AHEAD = 3, 20  # route points
 
 # Ours: agents have no pedals, so this much deceleration shows as a brake light.
@@ -168,7 +168,7 @@ def render(
 def speed_value(speed: jax.Array) -> jax.Array:
     """The byte that stands for a speed: 136 at rest, 255 from 33.3 m/s on.
 
-    Source: carl-facts 2.2: 127 + int(128 clip(v + 2.67, 0, 36) / 36).
+    Source: the authors' code: 127 + int(128 clip(v + 2.67, 0, 36) / 36).
 
     Args:
       speed: (...) m/s.
