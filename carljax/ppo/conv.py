@@ -1,8 +1,8 @@
 """Convolutions whose gradients are fast on XLA:CPU inside `lax.scan`, where the plain ones are not.
 
 On a CPU the weight gradient of a convolution in a loop body keeps a layout that no fast kernel takes
-(22 to 75 times slower), the input gradient of a strided one runs on one thread, and a tall matrix
-product that contracts over its rows is three times slower than the same with transposed operands. The
+(22 to 75 times slower), input gradients run on one thread, and a matrix product that contracts over
+the rows of two tall matrices is three times slower than the same with one of them transposed. The
 functions here write out the fast forms. GPUs and TPUs have no such trouble and get the plain ones.
 
 The platform is chosen at lowering (`lax.platform_dependent`), not by `jax.default_backend()` at trace
@@ -12,9 +12,12 @@ time: a program traced on a machine with a GPU may still be compiled for its CPU
 from __future__ import annotations
 
 import functools
+from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 _NHWC = ("NHWC", "HWIO", "NHWC")
 
@@ -55,7 +58,8 @@ def _conv_bwd(
         return pull_back(g)
 
     def fast(x: jax.Array, w: jax.Array, g: jax.Array) -> tuple[jax.Array, jax.Array]:
-        return _input_gradient(x, w, g, stride), _weight_gradient(x, w, g, stride)
+        dx = _dense_gradient(x, w, g) if stride == 1 else _strided_gradient(x, w, g, stride)
+        return dx, _weight_gradient(x, w, g, stride)
 
     return jax.lax.platform_dependent(x, w, g, cpu=fast, default=plain)
 
@@ -77,7 +81,24 @@ def _weight_gradient(x: jax.Array, w: jax.Array, g: jax.Array, stride: int) -> j
     return dw[:, :kernel, :kernel].transpose(1, 2, 0, 3)
 
 
-def _input_gradient(x: jax.Array, w: jax.Array, g: jax.Array, stride: int) -> jax.Array:
+def _dense_gradient(x: jax.Array, w: jax.Array, g: jax.Array) -> jax.Array:
+    """Input gradient at stride 1: one matrix product, then each tap added where it came from.
+
+    Eigen's convolution is up to a hundred times slower on the small, deep images that need this.
+    """
+    kernel, _, num_in, num_out = w.shape
+    num, rows, cols, _ = g.shape
+    taps = g.reshape(-1, num_out) @ w.reshape(-1, num_out).T
+    taps = taps.reshape(num, rows, cols, kernel, kernel, num_in)
+    dx = jnp.zeros(x.shape, x.dtype)
+    for i in range(kernel):
+        for j in range(kernel):
+            below, right = x.shape[1] - rows - i, x.shape[2] - cols - j
+            dx += jnp.pad(taps[:, :, :, i, j], ((0, 0), (i, below), (j, right), (0, 0)))
+    return dx
+
+
+def _strided_gradient(x: jax.Array, w: jax.Array, g: jax.Array, stride: int) -> jax.Array:
     """Input gradient as one stride-1 convolution, then depth to space.
 
     Pixel s p + a of x gets sum_q g[p - q] w[s q + a]: each of the s x s phases a is one group of
@@ -100,55 +121,74 @@ def _input_gradient(x: jax.Array, w: jax.Array, g: jax.Array, stride: int) -> ja
     return jnp.pad(dx, missing)
 
 
-def patches(x: jax.Array, size: int) -> jax.Array:
-    """Cuts images into square patches.
+@functools.partial(jax.custom_vjp, nondiff_argnums=(2,))
+def patch_conv(x: jax.Array, w: jax.Array, size: int) -> jax.Array:
+    """Convolves with a stride equal to the kernel: one matrix product over the patches.
 
     Args:
-      x: (N, H, W, C); H and W are multiples of `size`.
+      x: (N, H, W, I) uint8 or float32; H and W are multiples of `size`.
+      w: (size, size, I, O) float32.
       size: side of a patch.
 
     Returns:
-      (N, H / size, W / size, size * size * C), each patch row by row.
+      (N, H / size, W / size, O) float32.
+    """
+    return jax.lax.platform_dependent(
+        x, w, cpu=_by_rows(size), default=lambda x, w: _plain(x.astype(w.dtype), w, size)
+    )
+
+
+def _patch_rows(x: jax.Array, size: int) -> list[jax.Array]:
+    """Returns, for each row of a patch, (patches, size * I) float32.
+
+    A row of a patch is contiguous in the image. To work on one at a time costs no transpose, and the
+    float32 copy of a small image's row fits the cache where that of the image doesn't.
     """
     num, height, width, channels = x.shape
-    rows = x.reshape(num, height // size, size, width // size, size * channels)
-    # Slices joined together: on a CPU three times faster than the transpose they amount to.
-    return jnp.concatenate([rows[:, :, i] for i in range(size)], axis=-1)
+    x = x.reshape(num, height // size, size, width // size, size * channels)
+    return [x[:, :, i].reshape(-1, size * channels).astype(jnp.float32) for i in range(size)]
 
 
-@jax.custom_vjp
-def tall_matmul(x: jax.Array, w: jax.Array) -> jax.Array:
-    """Multiplies matrices; made for many more rows than columns.
+def _by_rows(size: int) -> Callable[[jax.Array, jax.Array], jax.Array]:
+    def product(x: jax.Array, w: jax.Array) -> jax.Array:
+        num, height, width, _ = x.shape
+        kernels = w.reshape(size, -1, w.shape[-1])
+        out = sum(row @ kernel for row, kernel in zip(_patch_rows(x, size), kernels, strict=True))
+        return jnp.reshape(out, (num, height // size, width // size, w.shape[-1]))
 
-    Args:
-      x: (R, I) float32.
-      w: (I, O) float32.
-
-    Returns:
-      (R, O) float32.
-    """
-    return x @ w
+    return product
 
 
-def _tall_matmul_fwd(
-    x: jax.Array, w: jax.Array
+def _patch_conv_fwd(
+    x: jax.Array, w: jax.Array, size: int
 ) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
-    return x @ w, (x, w)
+    return patch_conv(x, w, size), (x, w)
 
 
-def _tall_matmul_bwd(
-    residuals: tuple[jax.Array, jax.Array], g: jax.Array
-) -> tuple[jax.Array, jax.Array]:
+def _patch_conv_bwd(
+    size: int, residuals: tuple[jax.Array, jax.Array], g: jax.Array
+) -> tuple[Any, jax.Array]:
     x, w = residuals
+    flat = g.reshape(-1, g.shape[-1])
 
-    def plain(x: jax.Array, g: jax.Array) -> jax.Array:
-        return x.T @ g
+    def plain(x: jax.Array, w: jax.Array, g: jax.Array) -> jax.Array:
+        x = x.astype(w.dtype)
+        return jax.vjp(lambda w: _plain(x, w, size), w)[1](g)[0]
 
-    def fast(x: jax.Array, g: jax.Array) -> jax.Array:
-        # The barrier keeps XLA from folding the transpose back into the product.
-        return (jax.lax.optimization_barrier(g.T) @ x).T
+    def fast(x: jax.Array, w: jax.Array, g: jax.Array) -> jax.Array:
+        # Contracting over the rows of both is three times slower on a CPU than with one transposed;
+        # the barriers keep XLA from folding the transposes back into the products.
+        transposed = jax.lax.optimization_barrier(g.reshape(-1, g.shape[-1]).T)
+        products = jax.lax.optimization_barrier([transposed @ row for row in _patch_rows(x, size)])
+        return jnp.stack([product.T for product in products]).reshape(w.shape)
 
-    return g @ w.T, jax.lax.platform_dependent(x, g, cpu=fast, default=plain)
+    dw = jax.lax.platform_dependent(x, w, g, cpu=fast, default=plain)
+    if not jnp.issubdtype(x.dtype, jnp.floating):
+        return np.zeros(x.shape, jax.dtypes.float0), dw
+    num, height, width, channels = x.shape
+    rows = [flat @ kernel.T for kernel in w.reshape(size, -1, w.shape[-1])]
+    rows = [row.reshape(num, height // size, width // size, size * channels) for row in rows]
+    return jnp.stack(rows, axis=2).reshape(x.shape), dw
 
 
-tall_matmul.defvjp(_tall_matmul_fwd, _tall_matmul_bwd)
+patch_conv.defvjp(_patch_conv_fwd, _patch_conv_bwd)

@@ -136,8 +136,9 @@ def _sum_over(function: Any, pieces: list[jax.Array]) -> Any:
     def add(total: Any, piece: list[jax.Array]) -> tuple[Any, None]:
         return jax.tree.map(jnp.add, total, function(*piece)), None
 
-    first = function(*[x[0] for x in pieces])
-    return jax.lax.scan(add, first, [x[1:] for x in pieces])[0]
+    like = jax.eval_shape(function, *[x[0] for x in pieces])
+    zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), like)
+    return jax.lax.scan(add, zeros, pieces)[0]
 
 
 def normalise(advantage: jax.Array, weight: jax.Array) -> jax.Array:
