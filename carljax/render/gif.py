@@ -1,0 +1,84 @@
+"""An episode as an animated GIF, driven by the deterministic policy; every third step is drawn."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from PIL import Image
+
+from carljax import drive
+from carljax.ppo import trainer
+from carljax.ppo.networks import ActorCritic
+from carljax.render.episode_view import frame, read_world
+from carljax.sim.env import DrivingEnv
+from carljax.sim.types import State
+
+FRAME_EVERY = 3  # simulator steps of 0.1 s
+FRAME_MS = 100  # three times as fast as real
+MAX_FRAMES = 400
+NUM_COLOURS = 96
+
+
+def save(
+    path: Path, env: DrivingEnv, network: ActorCritic, params: Any, scenario: int, seed: int = 0
+) -> None:
+    """Drives one route with the deterministic policy and writes it as an animated GIF.
+
+    Args:
+      path: the file to write.
+      env: with the route.
+      network: actor and critic.
+      params: its variables.
+      scenario: row of the environment's bank.
+      seed: of the traffic; 0 drives what `evaluate` drives.
+    """
+    world = read_world(env, scenario)
+    frames = [
+        frame(env, world, state, command)
+        for state, command in episode(env, network, params, scenario, seed)
+    ]
+    path.parent.mkdir(parents=True, exist_ok=True)
+    palette = frames[len(frames) // 2].quantize(NUM_COLOURS)
+    small = [each.quantize(palette=palette, dither=Image.Dither.NONE) for each in frames]
+    small[0].save(
+        path, save_all=True, append_images=small[1:], duration=FRAME_MS, loop=0, optimize=True
+    )
+
+
+def episode(
+    env: DrivingEnv, network: ActorCritic, params: Any, scenario: int, seed: int = 0
+) -> Iterator[tuple[State, np.ndarray]]:
+    """Drives one route, giving every third state and the last.
+
+    Args:
+      env: with the route.
+      network: actor and critic.
+      params: its variables.
+      scenario: row of the environment's bank.
+      seed: of the traffic.
+
+    Yields:
+      The unbatched state on the host, and the (2,) action that led to it.
+    """
+    options = trainer.compiler_options(jax.default_backend())
+    step = jax.jit(functools.partial(drive.step, network=network), compiler_options=options)
+    params = jax.device_get(params)
+    state = jax.jit(drive.start)(env, jnp.array([scenario]), jax.random.key(seed))
+    for number in range(1, MAX_FRAMES * FRAME_EVERY + 1):
+        state, command = step(env, params=params, state=state)
+        is_last = float(state.done[0]) > 0
+        if is_last or number % FRAME_EVERY == 0:
+            one = jax.tree.map(lambda x: x[0], state.replace(pipeline_state=_keyless(state)))
+            yield jax.device_get(one), np.asarray(command[0])
+        if is_last:
+            return
+
+
+def _keyless(state: State) -> Any:
+    return state.pipeline_state.replace(key=jnp.zeros(state.done.shape))
