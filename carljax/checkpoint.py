@@ -9,6 +9,7 @@ best score.
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -107,8 +108,29 @@ def _score(metrics: Any) -> float:
 @contextmanager
 def _manager(run_dir: Path, keep: int | None = None) -> Iterator[ocp.CheckpointManager]:
     """Opens the run's checkpoints; only with `keep` for writing."""
+    with _quiet():
+        manager = ocp.CheckpointManager((run_dir / FOLDER).absolute(), options=_options(keep))
+        try:
+            yield manager
+        finally:
+            manager.close()
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Keeps Orbax's notes about options chosen on purpose off the terminal; errors pass."""
+    logger = logging.getLogger("absl")
+    level = logger.level
+    logger.setLevel(logging.ERROR)
+    try:
+        yield
+    finally:
+        logger.setLevel(level)
+
+
+def _options(keep: int | None) -> ocp.CheckpointManagerOptions:
     policies = checkpoint_managers
-    options = ocp.CheckpointManagerOptions(
+    return ocp.CheckpointManagerOptions(
         create=keep is not None,
         read_only=keep is None,
         cleanup_tmp_directories=keep is not None,
@@ -121,11 +143,6 @@ def _manager(run_dir: Path, keep: int | None = None) -> Iterator[ocp.CheckpointM
             ]
         ),
     )
-    manager = ocp.CheckpointManager((run_dir / FOLDER).absolute(), options=options)
-    try:
-        yield manager
-    finally:
-        manager.close()
 
 
 def _pick(manager: ocp.CheckpointManager, run_dir: Path, update: int | None) -> int:

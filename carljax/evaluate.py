@@ -21,14 +21,14 @@ import numpy as np
 import tyro
 from rich.console import Console
 
-from carljax import atomic, build, checkpoint, drive, machine, run_dir
+from carljax import atomic, build, checkpoint, drive, machine, run_dir, scores
 from carljax.checkpoint import CheckpointError
 from carljax.config import HELD_OUT_SEED, ConfigError, TrainConfig
 from carljax.ppo import trainer
 from carljax.ppo.networks import ActorCritic
 from carljax.render import gif
 from carljax.reward import collision
-from carljax.scores import EvalResult, RouteScore, table
+from carljax.scores import EvalResult, RouteScore
 from carljax.sim.env import DrivingEnv
 from carljax.sim.road_network import MapError
 from carljax.sim.route_generator import RouteError
@@ -190,7 +190,7 @@ def run(command: Command, console: Console) -> int:
     network = ActorCritic(config.network)
     params, update = _load_params(command, path, update, config, env)
     result = evaluate(env, network, params, [town.network.name for town in towns])
-    console.print(table(result))
+    scores.show(result, console)
     if command.json is not None:
         policy = "untrained" if command.untrained else str(path)
         save(result, command.json, policy=policy, update=update)

@@ -13,6 +13,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from rich.console import Console
 from rich.table import Table
 
 # source: CARLA leaderboard 2.0, infraction penalties
@@ -126,25 +127,27 @@ class EvalResult:
         }
 
 
-def table(result: EvalResult) -> Table:
-    """Lays out the scores for a terminal: all routes, then each town; below, infractions per km."""
-    out = Table(title=f"{len(result.routes)} held-out routes, deterministic policy")
-    for name in ("", "routes", "Driving Score", "route completion %", "finished %"):
-        out.add_column(name, justify="left" if not name else "right")
+def show(result: EvalResult, console: Console) -> None:
+    """Prints the scores as two tables: by town, and infractions by kind."""
+    towns = Table(title=f"{len(result.routes)} held-out routes, deterministic policy")
+    for name in ("town", "routes", "Driving Score", "route completion %", "finished %"):
+        towns.add_column(name, justify="left" if name == "town" else "right")
     for town, part in {"all": result, **result.by_town()}.items():
         score, completion = part.driving_score, part.completion
-        out.add_row(
+        towns.add_row(
             town,
             str(len(part.routes)),
             f"{score[0]:.1f} ± {score[1]:.1f}",
             f"{completion[0]:.1f} ± {completion[1]:.1f}",
             f"{100 * part.finished_frac:.0f}",
         )
-    out.add_section()
+    rates = Table(title=f"infractions on {result.completed_km:.1f} km")
+    for name in ("infraction", "factor", "per km"):
+        rates.add_column(name, justify="left" if name == "infraction" else "right")
     for name, rate in result.infractions_per_km.items():
-        factor = f"x {FACTORS[name]:.2f}" if name in FACTORS else "ends the route"
-        out.add_row(f"{name} per km", "", factor, f"{rate:.3f}", "")
-    return out
+        factor = f"{FACTORS[name]:.2f}" if name in FACTORS else "ends the route"
+        rates.add_row(name.replace("_", " "), factor, f"{rate:.3f}")
+    console.print(towns, rates)
 
 
 def _mean_and_std(values: Sequence[float]) -> tuple[float, float]:

@@ -131,8 +131,9 @@ def run(command: Command, console: Console) -> int:
 def score(made: Setup, params: Any, path: Path, console: Console) -> None:
     """Evaluates the policy on held-out routes; prints the table and writes evaluation.json."""
     env = build.environment(made.config, made.towns, made.config.run.eval_routes, HELD_OUT_SEED)
-    result = evaluate.evaluate(env, made.network, params)
-    console.print(scores.table(result))
+    names = [town.network.name for town in made.towns]
+    result = evaluate.evaluate(env, made.network, params, names)
+    scores.show(result, console)
     evaluate.save(result, path / evaluate.FILE)
 
 
