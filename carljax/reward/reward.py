@@ -37,20 +37,20 @@ SOFT_FACTORS = ("outside_lanes", "lane", "speed_limit", "ttc", "comfort")
 CAUSES = ("collision", "off_road", "red_light", "stop_sign", "route_deviation", "blocked")
 
 
-def init(ego: EgoState, situation: Situation) -> RewardState:
-    """What the reward remembers at the start of an episode.
+def init(ego: EgoState, num_stop_lines: int) -> RewardState:
+    """What the reward remembers at the start of a route.
 
     Args:
       ego: the ego at the start.
-      situation: its situation there.
+      num_stop_lines: Q, places for the route's stop lines.
 
     Returns:
-      Memory with the progress of the start already paid and nothing else in it.
+      Memory with nothing in it.
     """
-    unset = jnp.zeros(situation.stop_kind.shape, bool)
+    unset = jnp.zeros(num_stop_lines, bool)
     return RewardState(
         history=comfort.empty_history(ego),
-        route_s=situation.route_s,
+        route_s=jnp.float32(0.0),
         ttc_ticks=jnp.int32(0),
         comfort_ticks=jnp.zeros(len(comfort.METRICS), jnp.int32),
         stopped_s=jnp.float32(0.0),

@@ -91,26 +91,18 @@ class DrivingEnv:
           scenario_idx: () int32, row of the bank.
           key: PRNG key, of all that the scenario leaves open.
         """
-        key_agents, key_light, key = jax.random.split(key, 3)
-        bank, zero_idx = self.bank, jnp.zeros((), jnp.int32)
-        stretch, first = route.window(bank.routes, scenario_idx, zero_idx)
-        light_time = jax.random.uniform(key_light, (), maxval=LIGHT_CLOCK)
-        ego = _ego_at(stretch.xy[0], stretch.yaw[0])
-        seen = self._situation(ego, stretch, first, zero_idx, light_time)
-        agents = traffic.initial(
-            bank.agent_lane[scenario_idx],
-            bank.agent_s[scenario_idx],
-            bank.agent_speed[scenario_idx],
-            bank.road_map,
-            key_agents,
+        key_light, key = jax.random.split(key)
+        routes, zero_idx = self.bank.routes, jnp.zeros((), jnp.int32)
+        ego = _ego_at(
+            routes.xy[scenario_idx, 0], routes.z[scenario_idx], routes.yaw[scenario_idx, 0]
         )
         sim = SimState(
-            ego=ego.replace(z=seen.lane_z),
-            agents=agents,
-            reward_state=reward.init(ego, seen),
+            ego=ego,
+            agents=jax.tree.map(lambda x: x[scenario_idx], self.bank.agents),
+            reward_state=reward.init(ego, routes.stop_kind.shape[1]),
             scenario_idx=scenario_idx.astype(jnp.int32),
             route_idx=zero_idx,
-            light_time=light_time,
+            light_time=jax.random.uniform(key_light, (), maxval=LIGHT_CLOCK),
             step_count=zero_idx,
             key=key,
         )
@@ -207,12 +199,12 @@ def make_env(bank: ScenarioBank, config: EnvConfig, reward_config: RewardConfig)
     )
 
 
-def _ego_at(xy: jax.Array, yaw: jax.Array) -> EgoState:
+def _ego_at(xy: jax.Array, z: jax.Array, yaw: jax.Array) -> EgoState:
     """The ego at rest."""
     zero = jnp.zeros((), jnp.float32)
     return EgoState(
         xy=xy,
-        z=zero,
+        z=z,
         yaw=yaw,
         speed=zero,
         slip=zero,

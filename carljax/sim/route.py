@@ -29,6 +29,7 @@ class Route:
       in_junction: (R,) bool.
       num_points: () int32.
       length: () m, of the whole route.
+      z: () m, height of its first point.
       town: () int32.
       stop_idx: (Q,) int32, route index of each stop line.
       stop_xy: (Q, 2) m, its centre; stop_yaw: (Q,) rad, direction of travel; stop_s: (Q,) m on the
@@ -50,6 +51,7 @@ class Route:
     in_junction: jax.Array
     num_points: jax.Array
     length: jax.Array
+    z: jax.Array
     town: jax.Array
     stop_idx: jax.Array
     stop_xy: jax.Array

@@ -198,6 +198,7 @@ def _assemble(
         in_junction=pad(in_junction, sizes.num_points),
         num_points=np.int32(num),
         length=np.float32(s[-1]),
+        z=np.float32(table.point_xyz[table.start[lane[0]] + int(lane_s[0]), 2]),
         town=np.int32(first.town),
         stop_idx=pad(stops, sizes.num_stops, -1).astype(np.int32),
         stop_xy=pad(pose[stops, :2], sizes.num_stops, 0.0).astype(np.float32),

@@ -1,7 +1,7 @@
 """The bank of scenarios: routes and traffic made ahead, drawn from at every reset.
 
-A scenario is a route, the places where traffic stands at its start, and nothing else: light phases,
-sizes and tempers of drivers are drawn at reset, so no two episodes on one scenario are the same.
+A scenario is a route and the traffic at its start. The phase of the lights and every choice that
+traffic makes later are drawn anew, so no two episodes on one scenario are the same.
 """
 
 from __future__ import annotations
@@ -13,12 +13,13 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from carljax.sim import road_map_builder, route_generator, spawn
+from carljax.sim import road_map_builder, route_generator, spawn, traffic
 from carljax.sim import route as route_module
 from carljax.sim.road_map import RoadMap
 from carljax.sim.route import Route
 from carljax.sim.route_generator import RouteSizes
 from carljax.sim.town import Town, offsets
+from carljax.sim.types import Agents
 
 TRAFFIC_RADIUS = 140.0  # m around the start, where traffic stands at first
 EGO_CLEARANCE = 18.0  # m kept free around the start
@@ -32,26 +33,22 @@ class ScenarioBank:
     Attributes:
       road_map: the towns.
       routes: `Route` with a leading axis S.
-      agent_lane: (S, N) int32, lane row of each agent at the start, -1 for an empty slot.
-      agent_s: (S, N) m along it.
-      agent_speed: (S, N) m/s.
+      agents: `Agents` at the start, with a leading axis S.
     """
 
     road_map: RoadMap
     routes: Route
-    agent_lane: jax.Array
-    agent_s: jax.Array
-    agent_speed: jax.Array
+    agents: Agents
 
     @property
     def num_scenarios(self) -> int:
         """S."""
-        return self.agent_lane.shape[0]
+        return self.agents.kind.shape[0]
 
     @property
     def num_agents(self) -> int:
         """N."""
-        return self.agent_lane.shape[1]
+        return self.agents.kind.shape[1]
 
 
 def make_bank(
@@ -87,12 +84,19 @@ def make_bank(
         routes.append(route)
         agents.append(_traffic(towns[town], found[town], firsts[town].lane, route, num_agents, rng))
     lane, s, speed = (np.stack(values) for values in zip(*agents, strict=True))
+    road_map = road_map_builder.build(towns)
+    keys = jax.random.split(jax.random.key(seed), num_scenarios)
+    initial = jax.jit(jax.vmap(traffic.initial, in_axes=(0, 0, 0, None, 0)))
     return ScenarioBank(
-        road_map=road_map_builder.build(towns),
+        road_map=road_map,
         routes=jax.tree.map(lambda *x: jnp.asarray(np.stack(x)), *routes),
-        agent_lane=jnp.asarray(lane, jnp.int32),
-        agent_s=jnp.asarray(s, jnp.float32),
-        agent_speed=jnp.asarray(speed, jnp.float32),
+        agents=initial(
+            jnp.asarray(lane, jnp.int32),
+            jnp.asarray(s, jnp.float32),
+            jnp.asarray(speed, jnp.float32),
+            road_map,
+            keys,
+        ),
     )
 
 

@@ -1,0 +1,106 @@
+"""Builders for the reward's tests: a straight road to the east, everything overridable by name."""
+
+import functools
+
+import jax
+import numpy as np
+
+from carljax.reward import reward
+from carljax.sim.bicycle import VehicleParams
+from carljax.sim.types import (
+    KIND_NONE,
+    KIND_VEHICLE,
+    LIGHT_GREEN,
+    STOP_NONE,
+    Agents,
+    EgoState,
+    SimState,
+    Situation,
+)
+
+VEHICLE = VehicleParams()
+DT = 0.1
+
+
+@functools.partial(jax.jit, static_argnames="config")
+def compute(state, ego, agents, situation, config):
+    """The composed reward, compiled once for each configuration and size."""
+    return reward.compute(state, ego, agents, situation, VEHICLE, config, DT)
+
+
+def f32(value):
+    return np.asarray(value, np.float32)
+
+
+def make_ego(xy=(0.0, 0.0), yaw=0.0, speed=5.0, **fields):
+    scalars = dict.fromkeys(("z", "slip", "yaw_rate", "accel", "steer", "throttle", "brake"), 0.0)
+    scalars |= {"yaw": yaw, "speed": speed} | fields
+    return EgoState(xy=f32(xy), **{name: f32(value) for name, value in scalars.items()})
+
+
+def make_agents(num=2, **fields):
+    """`num` slots, empty unless `xy` is given; given fields fill the first slots."""
+    filled = len(fields["xy"]) if "xy" in fields else 0
+    defaults = {
+        "xy": np.zeros((num, 2)),
+        "length": np.full(num, 4.0),
+        "width": np.full(num, 2.0),
+        "desired_speed_frac": np.ones(num),
+        "kind": np.where(np.arange(num) < filled, KIND_VEHICLE, KIND_NONE),
+        "lanes": np.full((num, 3), -1),
+        "has_stopped": np.zeros(num, bool),
+    }
+    for name in ("z", "yaw", "speed", "yaw_rate", "accel", "lane_s", "wait_s"):
+        defaults[name] = np.zeros(num)
+    for name, value in fields.items():
+        defaults[name][: len(value)] = value
+    kinds = {"kind": np.int32, "lanes": np.int32, "has_stopped": bool}
+    return Agents(**{k: np.asarray(v, kinds.get(k, np.float32)) for k, v in defaults.items()})
+
+
+def make_situation(num_lines=3, **fields):
+    """On the centre of a 3.5 m lane to the east, at 100 m of a route of 1 km, no stop lines."""
+    values = {
+        "lane_lateral": 0.0,
+        "lane_yaw": 0.0,
+        "lane_z": 0.0,
+        "lane_width": 3.5,
+        "lane_in_junction": False,
+        "on_parking": False,
+        "off_road_frac": 0.0,
+        "route_idx": 100,
+        "route_s": 100.0,
+        "route_length": 1000.0,
+        "route_num_points": 1001,
+        "route_distance": 0.0,
+        "speed_limit": 10.0,
+        "stop_s": np.full(num_lines, 1e6),
+        "stop_xy": np.zeros((num_lines, 2)),
+        "stop_yaw": np.zeros(num_lines),
+        "stop_width": np.full(num_lines, 3.5),
+        "stop_kind": np.full(num_lines, STOP_NONE),
+        "stop_light": np.full(num_lines, LIGHT_GREEN),
+    } | fields
+    kinds = dict.fromkeys(("route_idx", "route_num_points", "stop_kind", "stop_light"), np.int32)
+    kinds |= dict.fromkeys(("lane_in_junction", "on_parking"), bool)
+    return Situation(**{k: np.asarray(v, kinds.get(k, np.float32)) for k, v in values.items()})
+
+
+def make_state(ego, agents, situation, step_count=0, **memory):
+    """The state before a step: nothing in the reward's memory but what `memory` says.
+
+    Progress up to the situation's place is already paid.
+    """
+    memory = {"route_s": situation.route_s} | memory
+    return SimState(
+        ego=ego,
+        agents=agents,
+        reward_state=reward.init(ego, situation.stop_kind.shape[0]).replace(
+            **{"route_s": situation.route_s, **memory}
+        ),
+        scenario_idx=np.int32(0),
+        route_idx=situation.route_idx,
+        light_time=f32(0.0),
+        step_count=np.int32(step_count),
+        key=np.uint32(0),
+    )
