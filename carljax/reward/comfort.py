@@ -68,7 +68,7 @@ def smoothing_matrix(num: int) -> np.ndarray:
     """The filter of window 8, degree 2 as a matrix on `num` samples.
 
     An even window has no middle sample: inside, SciPy evaluates half a sample later than the sample
-    filtered, and so do we.
+    filtered, and so do we. It makes the jerk of a steady ramp read 0.83 of its slope.
 
     Args:
       num: samples, at least 8.

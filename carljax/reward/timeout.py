@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import jax
+import jax.numpy as jnp
 
 
 def is_timeout(step_count: jax.Array, limit: jax.Array | float, dt: float) -> jax.Array:
@@ -16,4 +17,4 @@ def is_timeout(step_count: jax.Array, limit: jax.Array | float, dt: float) -> ja
     Returns:
       () bool.
     """
-    return step_count * dt > limit + 0.5 * dt
+    return step_count.astype(jnp.float32) * dt > limit + 0.5 * dt
