@@ -127,7 +127,10 @@ def make_train_step(network: ActorCritic, config: PPOConfig, mesh: Mesh) -> Trai
         check_vma=False,
     )
     options = compiler_options(mesh.devices.flat[0].platform)
-    return jax.jit(sharded, donate_argnums=1, compiler_options=options)
+    # Said outright: on one device the compiler would call the result's sharding by another name than
+    # that of the first state, and the second call would compile once more.
+    out = (shardings(mesh), NamedSharding(mesh, PartitionSpec()))
+    return jax.jit(sharded, donate_argnums=1, out_shardings=out, compiler_options=options)
 
 
 def _local_step(
