@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import collections
 import dataclasses
-from typing import IO
+from typing import IO, Any
 
 import matplotlib
 
@@ -33,7 +33,13 @@ SURFACES = {
     "driving": ("#585c63", "road"),
 }
 JUNCTION = "#63676e"
-PAINT = {"white": "#f6f6f3", "yellow": "#f3c540", "blue": "#6fa0e0", "red": "#d95b4b", "orange": "#ef9a3c"}
+PAINT = {
+    "white": "#f6f6f3",
+    "yellow": "#f3c540",
+    "blue": "#6fa0e0",
+    "red": "#d95b4b",
+    "orange": "#ef9a3c",
+}
 ARROW = "#8b9098"
 # metres: paint, stop line, dash and gap of broken lines, level of overpasses, way between arrows
 MARK_WIDTH, STOP_WIDTH, DASH, GAP, LEVEL, ARROW_STEP = 0.18, 0.55, 3.0, 4.5, 4.0, 45.0
@@ -79,7 +85,9 @@ def _surfaces(sheet: Sheet, lanes: list[Lane], z_order: float) -> None:
         colours.append(JUNCTION if in_junction else SURFACES[lane.kind][0])
     # The edge in the same colour hides the seams between neighbours.
     sheet.ax.add_collection(
-        PolyCollection(shapes, facecolors=colours, edgecolors=colours, linewidths=0.4, zorder=z_order)
+        PolyCollection(
+            shapes, facecolors=colours, edgecolors=colours, linewidths=0.4, zorder=z_order
+        )
     )
 
 
@@ -97,7 +105,7 @@ def _dashes(xy: np.ndarray) -> list[np.ndarray]:
 
 
 def _paint(sheet: Sheet, network: RoadNetwork, z_order: dict[int, float]) -> None:
-    lines = collections.defaultdict(list)
+    lines: dict[tuple[float, str], list[np.ndarray]] = collections.defaultdict(list)
     for mark in network.marks:
         z = _level(float(np.median(mark.z))) if len(mark.z) else 0
         shapes = _dashes(mark.xy) if mark.kind == MARK_BROKEN else [mark.xy]
@@ -197,7 +205,12 @@ def _signals(sheet: Sheet, network: RoadNetwork) -> list[Line2D]:
         if not len(xy):
             continue
         edge = "#20242a" if kind == "light" else "#c1121f" if kind != "stop" else "#ffffff"
-        style = {"marker": marker, "markerfacecolor": face, "markeredgecolor": edge, "linestyle": ""}
+        style: dict[str, Any] = {
+            "marker": marker,
+            "markerfacecolor": face,
+            "markeredgecolor": edge,
+            "linestyle": "",
+        }
         sheet.ax.plot(
             xy[:, 0], xy[:, 1], markersize=size, markeredgewidth=0.16 * size, zorder=903.0, **style
         )
@@ -205,8 +218,8 @@ def _signals(sheet: Sheet, network: RoadNetwork) -> list[Line2D]:
     for signal in network.signals:
         if signal.kind == "speed" and signal.value is not None:
             sheet.ax.text(
-                signal.xyz[0], signal.xyz[1], f"{signal.value * 3.6:.0f}", fontsize=size * 0.42, zorder=904.0,
-                ha="center", va="center_baseline", color="#20242a", clip_on=True,
+                signal.xyz[0], signal.xyz[1], f"{signal.value * 3.6:.0f}", fontsize=size * 0.42,
+                zorder=904.0, ha="center", va="center_baseline", color="#20242a", clip_on=True,
             )  # fmt: skip
     return handles
 
@@ -228,8 +241,8 @@ def _legend(ax: Axes, network: RoadNetwork, signs: list[Line2D]) -> None:
     names = {SURFACES[k][1]: SURFACES[k][0] for k in reversed(SURFACES) if k in kinds}
     handles: list = [Patch(facecolor=colour, label=name) for name, colour in names.items()]
     ax.legend(
-        handles=handles + signs, loc="upper left", bbox_to_anchor=(0.0, -0.005), fontsize=12, ncols=9,
-        frameon=False, handlelength=1.3, columnspacing=1.4, borderaxespad=0.2,
+        handles=handles + signs, loc="upper left", bbox_to_anchor=(0.0, -0.005), fontsize=12,
+        ncols=9, frameon=False, handlelength=1.3, columnspacing=1.4, borderaxespad=0.2,
     )  # fmt: skip
 
 
@@ -271,8 +284,8 @@ def figure(network: RoadNetwork, pixels: int = 2400) -> Figure:
     _legend(ax, network, _signals(sheet, network))
     _scale_bar(ax, low, size)
     length = sum(float(lane_distance(x)[-1]) for x in drawn if x.kind == "driving") / 1000
-    fig.text(0.008, 1 - 0.5 * head / total, f"{network.name}   {length:.1f} km of lanes, "
-             f"{len(network.junctions)} junctions", fontsize=15, va="center", color="#20242a")  # fmt: skip
+    title = f"{network.name}   {length:.1f} km of lanes, {len(network.junctions)} junctions"
+    fig.text(0.008, 1 - 0.5 * head / total, title, fontsize=15, va="center", color="#20242a")
     return fig
 
 

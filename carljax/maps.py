@@ -1,7 +1,7 @@
 """Looks at a town: `python -m carljax.maps info|draw|lanes FILE.xodr`.
 
-FILE is an OpenDRIVE file or the name of a bundled town. A file that can't be read ends with one line on
-stderr and exit status 2, and nothing is written.
+FILE is an OpenDRIVE file or the name of a bundled town. A file that can't be read ends with one
+line on stderr and exit status 2, and nothing is written.
 """
 
 from __future__ import annotations
@@ -59,9 +59,9 @@ class Draw:
 class Lanes:
     """Write the driving lanes of a town as NumPy arrays.
 
-    lane_xy (N,2) m, lane_ptr (L+1), lane_width (N) m, lane_z (N) m, lane_key (L,3) = road id, section,
-    lane id, succ (E,2) lane i leads to lane j, is_junction (L), speed_limit (L) m/s or nan, crosswalk_xy
-    with crosswalk_ptr, signal_id, signal_kind. Right-handed metres.
+    lane_xy (N,2) m, lane_ptr (L+1), lane_width (N) m, lane_z (N) m, lane_key (L,3) = road id,
+    section, lane id, succ (E,2) lane i leads to lane j, is_junction (L), speed_limit (L) m/s or
+    nan, crosswalk_xy with crosswalk_ptr, signal_id, signal_kind. Right-handed metres.
 
     Attributes:
       file: an OpenDRIVE file, or the name of a bundled town.
@@ -127,7 +127,12 @@ def counts(network: RoadNetwork) -> dict[str, object]:
     }
 
 
-_RANGES = {"lane width m": "{}, median {}, to {}", "x m": "{} to {}", "y m": "{} to {}", "z m": "{} to {}"}
+_RANGES = {
+    "lane width m": "{}, median {}, to {}",
+    "x m": "{} to {}",
+    "y m": "{} to {}",
+    "z m": "{} to {}",
+}
 
 
 def table(values: dict[str, object]) -> str:
@@ -219,7 +224,7 @@ def _draw(command: Draw) -> None:
 def main(args: Sequence[str] | None = None) -> int:
     """The command line; returns the exit status."""
     command = tyro.cli(
-        Info | Draw | Lanes,  # type: ignore[arg-type]
+        Info | Draw | Lanes,
         prog="python -m carljax.maps",
         description=__doc__.splitlines()[0],
         args=args,
@@ -232,7 +237,11 @@ def main(args: Sequence[str] | None = None) -> int:
             _draw(command)
         else:
             arrays = lane_arrays(read(command.file))
-            write_whole(command.out, command.file, lambda f: np.savez_compressed(f, **arrays))
+            write_whole(
+                command.out,
+                command.file,
+                lambda f: np.savez_compressed(f, **arrays),  # type: ignore[arg-type]
+            )
             print(command.out)
     except MapError as e:
         print(e, file=sys.stderr)

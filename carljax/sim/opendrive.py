@@ -2,9 +2,10 @@
 
     network = opendrive.load("Town01.xodr")
 
-`reference_line` has the geometry, `opendrive_roads` the file's records, `opendrive_lanes` samples them,
-`opendrive_links` joins the lanes, `opendrive_signals` and `opendrive_objects` read what stands on the road.
-Source: ASAM OpenDRIVE 1.8; where it leaves a choice, CARLA 0.9.16, whose towns these mostly are.
+`reference_line` has the geometry, `opendrive_roads` the file's records, `opendrive_lanes` samples
+them, `opendrive_links` joins the lanes, `opendrive_signals` and `opendrive_objects` read what
+stands on the road. Source: ASAM OpenDRIVE 1.8; where it leaves a choice, CARLA 0.9.16, whose towns
+these mostly are.
 """
 
 from __future__ import annotations
@@ -63,10 +64,23 @@ def _check_controllers(
     known = {signal.id for signal in signals}
     for controller in controllers.values():
         if any(name not in known for name in controller.signals):
-            warnings.add("controller of a signal that is not there", file.at("controller", controller.id))
+            warnings.add(
+                "controller of a signal that is not there", file.at("controller", controller.id)
+            )
     for junction in junctions.values():
         if any(name not in controllers for name in junction.controllers):
             warnings.add("junction's controller is not there", file.at("junction", junction.id))
+
+
+def _warn_unread(root: ET.Element, file: Place, warnings: Warnings) -> None:
+    """Names what the standard allows in a file, outside its roads, and this importer leaves out."""
+    if root.find(".//include") is not None:
+        warnings.add("<include> of another file is not read", file)
+    if root.find("station") is not None:
+        warnings.add("station is not read", file)
+    offset = root.find("header/offset")
+    if offset is not None and any(ox.number(offset, a, file, 0.0) for a in ("x", "y", "z", "hdg")):
+        warnings.add("header offset is not applied: coordinates stay as in the file", file)
 
 
 def load(path: str | os.PathLike[str]) -> RoadNetwork:
@@ -79,7 +93,8 @@ def load(path: str | os.PathLike[str]) -> RoadNetwork:
       Its lanes, links, marks, signals and objects; what was not read is in `warnings`.
 
     Raises:
-      MapError: one line that names the file, the road and lane where there is one, and what is wrong.
+      MapError: one line that names the file, the road and lane where there is one, and what is
+        wrong.
     """
     path = pathlib.Path(path)
     file, warnings = Place(str(path)), Warnings()
@@ -94,6 +109,9 @@ def load(path: str | os.PathLike[str]) -> RoadNetwork:
             road_lanes, road_marks = opendrive_lanes.sample_road(road, warnings)
             lanes += road_lanes
             marks += road_marks
+        for road in roads.values():
+            opendrive_objects.warn_unread(road, warnings)
+        _warn_unread(root, file, warnings)
     if not any(lane.kind == DRIVING for lane in lanes):
         raise file.error("has no lane of type 'driving'")
     lanes = opendrive_links.LaneGraph(roads, junctions, lanes, warnings).links()
@@ -102,7 +120,9 @@ def load(path: str | os.PathLike[str]) -> RoadNetwork:
     signals = opendrive_signals.SignalReader(roads, lanes, warnings).read(vendor)
     controllers = opendrive_signals.read_controllers(root, file)
     _check_controllers(controllers, junctions, signals, file, warnings)
-    stop_lines = [x for road in roads.values() for x in opendrive_objects.stop_lines(road, warnings)]
+    stop_lines = [
+        x for road in roads.values() for x in opendrive_objects.stop_lines(road, warnings)
+    ]
     walks = [x for road in roads.values() for x in opendrive_objects.crosswalks(road, warnings)]
     return RoadNetwork(
         name=path.stem,

@@ -1,6 +1,7 @@
 """Samples the lanes and road marks of OpenDRIVE roads into polylines.
 
-All lanes of a section share one set of arc lengths, so that neighbours have their points side by side.
+All lanes of a section share one set of arc lengths, so that neighbours have their points side by
+side.
 """
 
 from __future__ import annotations
@@ -95,7 +96,9 @@ class Positions:
     def insert(self, rows: np.ndarray, s: np.ndarray) -> Positions:
         """With plain positions `s` in front of the given rows."""
         return Positions(
-            np.insert(self.s, rows, s), np.insert(self.pick, rows, s), np.insert(self.turn, rows, 0.0)
+            np.insert(self.s, rows, s),
+            np.insert(self.pick, rows, s),
+            np.insert(self.turn, rows, 0.0),
         )
 
 
@@ -124,7 +127,7 @@ def _breaks(road: RoadSpec, section: SectionSpec) -> np.ndarray:
 def _corners(
     road: RoadSpec, section: SectionSpec, breaks: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """What happens at the breaks: jump sideways (m), turn of the heading (rad), and reach of the lanes (m)."""
+    """At each break: jump sideways (m), turn of the heading (rad), reach of the lanes (m)."""
     before = Positions(breaks, np.nextafter(breaks, -np.inf), np.zeros_like(breaks))
     a, b = evaluate(road, section, before), evaluate(road, section, _plain(breaks))
     jump = np.hypot(*(b.xy - a.xy).T)
@@ -143,19 +146,21 @@ def _round_corner(at: float, turn: float, reach: float) -> Positions:
     return Positions(s, s, -turn * part)
 
 
-def _first_positions(road: RoadSpec, section: SectionSpec) -> tuple[Positions, np.ndarray]:
-    """Positions STEP apart at most, with all breaks; and the breaks at which a record jumps.
+def _knots(
+    road: RoadSpec, section: SectionSpec
+) -> tuple[list[float], dict[int, Positions], np.ndarray]:
+    """Arc lengths to sample in any case, the corners at some of them, and where records jump.
 
     A jump becomes a ramp of twice its size along the road, a corner of the heading an arc.
     """
     breaks = _breaks(road, section)
+    around = np.concatenate([[section.s0], breaks, [section.s1]])
     knots, corners, jumps = [section.s0], {}, []
-    sizes = _corners(road, section, breaks) if len(breaks) else ([], [], [])
-    for i, (at, jump, turn, reach) in enumerate(zip(breaks, *sizes, strict=True)):
+    for i, (jump, turn, reach) in enumerate(zip(*_corners(road, section, breaks), strict=True)):
+        at = float(breaks[i])
         if jump > _JUMP:
-            low = (at + max(section.s0, breaks[i - 1] if i else -np.inf)) / 2
-            high = (at + min(section.s1, breaks[i + 1] if i + 1 < len(breaks) else np.inf)) / 2
             half = min(jump, STEP / 2)
+            low, high = (at + around[i]) / 2, (at + around[i + 2]) / 2
             knots += [max(at - half, low), min(at + half, high)]
             jumps.append(at)
         elif abs(turn) > _TURN:
@@ -163,22 +168,27 @@ def _first_positions(road: RoadSpec, section: SectionSpec) -> tuple[Positions, n
             knots.append(at)
         elif at > knots[-1] + _MERGE and at < section.s1 - _MERGE:
             knots.append(at)
-    knots.append(section.s1)
+    return [*knots, section.s1], corners, np.array(jumps)
+
+
+def _first_positions(road: RoadSpec, section: SectionSpec) -> tuple[Positions, np.ndarray]:
+    """Positions STEP apart at most, with all breaks; and the breaks at which a record jumps."""
+    knots, corners, jumps = _knots(road, section)
     parts = []
     for i, (start, end) in enumerate(zip(knots, knots[1:], strict=False)):
         count = max(int(np.ceil((end - start) / STEP - 1e-9)), 1)
-        if i in corners:
-            parts.append(corners[i])
         s = np.linspace(start, end, count, endpoint=False)
-        parts.append(_plain(s[1:] if i in corners else s))
+        if i in corners:
+            parts += [corners[i], _plain(s[1:])]
+        else:
+            parts.append(_plain(s))
     parts.append(_plain(np.array([section.s1])))
-    fields = ("s", "pick", "turn")
-    joined = [np.concatenate([getattr(p, f) for p in parts]) for f in fields]
-    return Positions(*joined), np.array(jumps)
+    joined = [np.concatenate([getattr(p, f) for p in parts]) for f in ("s", "pick", "turn")]
+    return Positions(*joined), jumps
 
 
 def _too_coarse(ends: Sampled, middle: Sampled) -> np.ndarray:
-    """(P-1,) whether the step is too long for a lane border or centre: chord, or error in its middle."""
+    """(P-1,) whether a step is too long for a border or centre: chord, or error in its middle."""
     ids = sorted(ends.border)
     t = np.stack([ends.border[i] for i in ids])
     tm = np.stack([middle.border[i] for i in ids])
@@ -195,7 +205,7 @@ def _too_coarse(ends: Sampled, middle: Sampled) -> np.ndarray:
 
 
 def sample_positions(road: RoadSpec, section: SectionSpec) -> Positions:
-    """Where to sample a section: its two ends, the starts of all records, and as densely as need be."""
+    """Where to sample a section: its ends, the starts of all records, and as densely as need be."""
     at, jumps = _first_positions(road, section)
     for _ in range(6):  # halves a step of 1 m down to STEP_MIN at most
         middle = _plain((at.s[1:] + at.s[:-1]) / 2)
@@ -233,8 +243,9 @@ def _crossing(xy: np.ndarray, before: slice, after: slice) -> tuple[int, int] | 
 def _onward(xy: np.ndarray, yaw: np.ndarray) -> np.ndarray:
     """Rows of the points but for those in loops.
 
-    On the inside of a bend tighter than its distance from the reference line a lane goes backwards and
-    crosses itself. A car cuts that loop off; where the fold reaches the lane's end it stops short of it.
+    On the inside of a bend tighter than its distance from the reference line a lane goes backwards
+    and crosses itself. A car cuts that loop off; where the fold reaches the lane's end it stops
+    short of it.
     """
     heading = np.stack([np.cos(yaw), np.sin(yaw)], axis=-1)
     step = np.diff(xy, axis=0)
@@ -269,8 +280,8 @@ def _lane(
         raise place.error(f"lies or reaches further than {OFFSET_MAX:g} m from its road's line")
     if (width < -0.01).any():
         warnings.add("lane with negative width: taken as 0", place)
-    # Heading of the curve xy + t n: d/ds = (1 - bend t) along, t' across; inside of a bend tighter than
-    # t the lane folds over, its heading stays that of the road.
+    # Heading of the curve xy + t n: d/ds = (1 - bend t) along, t' across; inside of a bend tighter
+    # than t the lane folds over, its heading stays that of the road.
     yaw = at.yaw + np.arctan2(slope, np.maximum(1.0 - at.bend * t, 1e-2))
     xyz = np.column_stack([at.line(t), at.z])
     rows = _onward(xyz[:, :2], yaw)
@@ -310,7 +321,7 @@ def _marks(spec: LaneSpec, section: SectionSpec, at: Sampled) -> list[RoadMark]:
 
 
 def sample_road(road: RoadSpec, warnings: Warnings) -> tuple[list[Lane], list[RoadMark]]:
-    """All lanes (but the middle one) of a road, and its marks; roads in junctions have none painted."""
+    """All lanes (but the middle one) of a road, and its marks; none are painted in junctions."""
     lanes, marks = [], []
     for section in road.sections:
         at = evaluate(road, section, sample_positions(road, section))

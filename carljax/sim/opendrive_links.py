@@ -1,4 +1,4 @@
-"""The lane graph of an OpenDRIVE file: successors through sections, roads and junctions; neighbours.
+"""The lane graph of an OpenDRIVE file: successors through sections, roads, junctions; neighbours.
 
 Source: ASAM OpenDRIVE 1.8, sections 10.3 (road linkage), 11.6 (lane linkage) and 12 (junctions).
 """
@@ -21,7 +21,7 @@ _MEET = 1.5
 
 @dataclasses.dataclass(frozen=True)
 class Connection:
-    """One way through a junction: from lanes of `incoming` to lanes of `connecting` at its `contact`.
+    """One way through a junction: from lanes of `incoming` to `connecting`, at its end `contact`.
 
     `lane_links` is None where the file leaves them out: lanes of equal ids are joined then.
     """
@@ -73,7 +73,11 @@ def read_junction(element: ET.Element, file: Place, warnings: Warnings) -> Junct
             if e.get("type") == "virtual":
                 warnings.add("virtual connection is not read", here)
             else:
-                connections.append(_connection(e, here))
+                way = _connection(e, here)
+                connections.append(way)
+                if kind == "direct":  # two roads that touch: the links hold in both directions
+                    back = tuple((b, a) for a, b in way.lane_links or ())
+                    connections.append(Connection(way.connecting, way.incoming, None, back))
     controllers = [
         (ox.number(e, "sequence", place, 0.0), ox.text(e, "id", place))
         for e in element.findall("controller")
@@ -99,7 +103,7 @@ class LaneGraph:
         lanes: list[Lane],
         warnings: Warnings,
     ) -> None:
-        """Indexes lanes by (road, section, lane) and junction connections by their incoming road."""
+        """Indexes lanes by (road, section, lane) and connections by (junction, incoming road)."""
         self.roads, self.junctions, self.lanes, self.warnings = roads, junctions, lanes, warnings
         self.index = {(x.road_id, x.section, x.lane_id): i for i, x in enumerate(lanes)}
         self.ways: dict[tuple[str, str], list[Connection]] = {}
@@ -128,7 +132,7 @@ class LaneGraph:
         found = None
         for end, section in (("start", road.sections[0]), ("end", road.sections[-1])):
             lane = section.lanes.get(lane_id)
-            if lane is None or self._entered_at(road, lane) != end:
+            if lane is None or not lane_id or self._entered_at(road, lane) != end:
                 continue
             found = self.index[road.id, section.index, lane_id]
             if contact != end and (contact or self._gap(source, found) > _MEET):
@@ -138,7 +142,9 @@ class LaneGraph:
                 self.warnings.add("contact point names the wrong end: put right", place)
         if found is None:
             if not any(lane_id in section.lanes for section in road.sections):
-                raise place.error(f"is linked to lane {lane_id} of road {ox.plain(road.id)}, which has none")
+                raise place.error(
+                    f"is linked to lane {lane_id} of road {ox.plain(road.id)}, which has none"
+                )
             self.warnings.add("link to a lane that does not begin there is not followed", place)
             return None
         return found if self.lanes[found].kind == DRIVING else None
@@ -178,7 +184,7 @@ class LaneGraph:
     def _within(
         self, road: RoadSpec, section: SectionSpec, lane: LaneSpec, lane_id: int, place: Place
     ) -> int | None:
-        target = section.lanes.get(lane_id)
+        target = section.lanes.get(lane_id) if lane_id else None
         if target is None or road.travels_along(target) != road.travels_along(lane):
             self.warnings.add("link to a lane that is not there or comes the other way", place)
             return None
@@ -196,6 +202,9 @@ class LaneGraph:
                 spec = section.lanes[lane.lane_id]
                 targets = self._next(i, road, section, spec)
                 found = tuple(dict.fromkeys(t for t in targets if t is not None))
+                if any(self._gap(i, t) > _MEET for t in found):
+                    place = road.place.at("section", section.index).at("lane", spec.id)
+                    self.warnings.add("linked lanes do not meet (gap over 1.5 m)", place)
             ahead.append(found)
             for target in found:
                 behind[target].append(i)
@@ -235,7 +244,9 @@ def _check_link(
     if link is None or link.id in known[link.kind]:
         return
     if link.kind == "junction":  # maps cut out of larger ones end so, and CARLA reads them
-        warnings.add("road leads to a junction that the file does not have: it ends there", road.place)
+        warnings.add(
+            "road leads to a junction that the file does not have: it ends there", road.place
+        )
         return
     raise road.place.error(f"{what} is road {ox.plain(link.id)}, which the file does not have")
 
@@ -261,7 +272,9 @@ def check_ids(
         for way in junction.connections:
             for road_id in (way.incoming, way.connecting):
                 if road_id not in roads:
-                    raise place.error(f"connects road {ox.plain(road_id)}, which the file does not have")
+                    raise place.error(
+                        f"connects road {ox.plain(road_id)}, which the file does not have"
+                    )
         if any(name not in roads for pair in junction.priority for name in pair):
             warnings.add("priority of a road that the file does not have", place)
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from carljax.sim import opendrive_xml as ox
 from carljax.sim.opendrive_roads import RoadSpec
-from carljax.sim.opendrive_signals import pose
+from carljax.sim.opendrive_signals import is_speed_object, pose
 from carljax.sim.opendrive_xml import Place, Warnings
 
 # Corners closer than this are one, m.
@@ -22,7 +22,7 @@ _LINE_MIN = 0.1
 
 
 def _rotation(yaw: float, pitch: float, roll: float) -> np.ndarray:
-    """(3, 3) rotation from the object's frame (u, v, z) to the world: roll, then pitch, then yaw."""
+    """(3, 3) rotation from the object's frame (u, v, z) to the world: roll, pitch, then yaw."""
     cy, sy, cp, sp = math.cos(yaw), math.sin(yaw), math.cos(pitch), math.sin(pitch)
     cr, sr = math.cos(roll), math.sin(roll)
     about_z = np.array([[cy, -sy, 0.0], [sy, cy, 0.0], [0.0, 0.0, 1.0]])
@@ -70,16 +70,27 @@ def _box(element: ET.Element, road: RoadSpec, place: Place) -> np.ndarray:
     return _open(origin + corners @ turn.T)
 
 
+def warn_unread(road: RoadSpec, warnings: Warnings) -> None:
+    """Counts the objects that mean nothing to this importer: poles, painted arrows, trees, ..."""
+    for element in road.element.findall("objects/object"):
+        name = element.get("name", "")
+        is_read = element.get("type") == "crosswalk" or name.startswith("StopLine")
+        if not is_read and not is_speed_object(element):
+            place = road.place.at("object", element.get("id", "?"))
+            warnings.add("object that is no crosswalk, stop line or Speed_NN: not read", place)
+
+
 def _is_area(outline: ET.Element) -> bool:
     """Whether a crosswalk's outline encloses an area.
 
-    In OpenDRIVE 1.4 every outline does. Since 1.5 (<outlines>) it can also be a line: closed="true",
-    a fill or a repeated first corner make it an area. CARLA 0.9.16 reads none of the later kind.
+    In OpenDRIVE 1.4 every outline does. Since 1.5 (<outlines>) it can also be a line:
+    closed="true", a fill or a repeated first corner make it an area. CARLA 0.9.16 reads none of the
+    later kind.
     """
     if outline.get("closed") is not None:
         return outline.get("closed") in ("true", "1")
-    corners = [tuple(sorted(c.attrib.items())) for c in outline if c.tag.startswith("corner")]
-    places = [tuple(kv for kv in c if kv[0] in ("u", "v", "s", "t")) for c in corners]
+    corners = [c for c in outline if c.tag.startswith("corner")]
+    places = [tuple(c.get(key) for key in "uvst") for c in corners]
     return outline.get("fillType") is not None or (len(places) > 2 and places[0] == places[-1])
 
 

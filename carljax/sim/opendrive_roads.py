@@ -21,8 +21,8 @@ ROAD_MAX = 100_000.0
 S_SLACK = 1e-3
 
 DRIVING = "driving"
-# Types on which the standard lets cars drive, but not everywhere or not everybody. CARLA's maps call
-# every lane to drive on "driving", and CARLA itself drives on no other.
+# Types on which the standard lets cars drive, but not everywhere or not everybody. CARLA's maps
+# call every lane to drive on "driving", and CARLA itself drives on no other.
 ALSO_DRIVABLE = frozenset(
     "entry exit onRamp offRamp connectingRamp slipLane bidirectional bus taxi HOV".split()
 )
@@ -75,7 +75,7 @@ class SectionSpec:
 
 @dataclasses.dataclass(frozen=True)
 class RoadLink:
-    """What a road's end touches: "road" or "junction", its id, and the end of that road if known."""
+    """What a road's end touches: "road" or "junction", its id, the end of that road if known."""
 
     kind: str
     id: str
@@ -133,7 +133,9 @@ def _param_poly3(shape: ET.Element, length: float, place: Place) -> rl.PlanarCur
         raise place.error(f"pRange {ox.shown(p_range)} is neither arcLength nor normalized")
     curve = rl.planar_curve(u, v, 1.0 if p_range == "normalized" else length, length)
     if not 0.01 < curve.scale < 100.0:
-        raise place.error(f"paramPoly3 is {curve.arc[-1]:.6g} m long, its length says {length:.6g} m")
+        raise place.error(
+            f"paramPoly3 is {curve.arc[-1]:.6g} m long, its length says {length:.6g} m"
+        )
     return curve
 
 
@@ -203,9 +205,14 @@ def _check_line(line: rl.ReferenceLine, total: float, place: Place, warnings: Wa
 
 # Double lines count as solid where either is; curb, grass and edge are no paint.
 _MARKS = {
-    "solid": MARK_SOLID, "broken": MARK_BROKEN, "solid solid": MARK_SOLID, "solid broken": MARK_SOLID,
-    "broken solid": MARK_SOLID, "broken broken": MARK_BROKEN, "botts dots": MARK_BROKEN,
-}  # fmt: skip
+    "solid": MARK_SOLID,
+    "broken": MARK_BROKEN,
+    "solid solid": MARK_SOLID,
+    "solid broken": MARK_SOLID,
+    "broken solid": MARK_SOLID,
+    "broken broken": MARK_BROKEN,
+    "botts dots": MARK_BROKEN,
+}
 
 
 def _mark(element: ET.Element, offset: float, place: Place, warnings: Warnings) -> MarkSpec:
@@ -238,14 +245,16 @@ def _speeds(
 def _lane(element: ET.Element, s0: float, place: Place, warnings: Warnings) -> LaneSpec:
     lane_id = ox.lane_number(element, "id", place)
     widths, borders = element.findall("width"), element.findall("border")
+    kind = element.get("type", "none")
     if lane_id and not widths and not borders:
-        raise place.error("has neither width nor border")
+        if kind != "none":
+            raise place.error("has neither width nor border")
+        warnings.add("lane of type 'none' without width: taken as 0", place)
     if widths and borders:
         warnings.add("lane with width and border: width is taken, as the standard says", place)
-    for tag in ("height", "access"):
+    for tag in ("height", "access", "rule"):
         if element.find(tag) is not None:
             warnings.add(f"lane {tag} is not read", place)
-    kind = element.get("type", "none")
     if kind in ALSO_DRIVABLE:
         warnings.add(f"lane type {kind!r} is not driven on", place)
     direction = element.get("direction", "standard")
@@ -319,7 +328,9 @@ def _link(road: ET.Element, tag: str, place: Place, warnings: Warnings) -> RoadL
         raise place.error(f"{tag} is a {ox.shown(kind)}, neither road nor junction")
     contact = element.get("contactPoint")
     if element.get("elementS") is not None:
-        warnings.add("link into the middle of a road holds only if it is near that road's end", place)
+        warnings.add(
+            "link into the middle of a road holds only if it is near that road's end", place
+        )
         contact = None
     if contact not in (None, "", "start", "end"):
         raise place.error(f"{tag} has contactPoint {ox.shown(contact or '')}")
@@ -339,6 +350,7 @@ def _warn_unread(road: ET.Element, place: Place, warnings: Warnings) -> None:
         ("railroad/switch", "railroad"),
         ("objects/bridge", "bridge"),
         ("objects/tunnel", "tunnel"),
+        ("signals/signal/dependency", "dependency between signals"),
     ):
         if road.find(path) is not None:
             warnings.add(f"{what} is not read", place)
@@ -375,9 +387,7 @@ def read_road(element: ET.Element, file: Place, warnings: Warnings) -> RoadSpec:
             ),
             lane_offset=cubics(element.findall("lanes/laneOffset"), "s", 0.0, place, warnings),
             sections=_sections(element, total, place, warnings),
-            speed=_speeds(
-                [(s, e) for s, t in types for e in t.findall("speed")], place, warnings
-            ),
+            speed=_speeds([(s, e) for s, t in types for e in t.findall("speed")], place, warnings),
             element=element,
             place=place,
         )

@@ -18,8 +18,8 @@ from carljax.sim.opendrive_roads import DRIVING, LaneSpec, RoadSpec, SectionSpec
 from carljax.sim.opendrive_xml import Place, Warnings
 from carljax.sim.road_network import Controller, Governed, Lane, Signal
 
-# source: OpenDRIVE 1.8 annex "signal types" (country OpenDRIVE): lights for cars. 1000002 and 1000007
-# are for pedestrians and cyclists.
+# source: OpenDRIVE 1.8 annex "signal types" (country OpenDRIVE): lights for cars. 1000002 and
+# 1000007 are for pedestrians and cyclists.
 LIGHT_TYPES = frozenset({"1000001", "1000008", "1000009", "1000010", "1000011", "1000012"})
 # source: CARLA 0.9.16; the numbers are those of the German road traffic regulations (StVO).
 SIGN_KINDS = {"206": "stop", "205": "yield", "274": "speed"}
@@ -45,6 +45,12 @@ class Spot:
         return frozenset(i for a, b in self.validity for i in section.lanes if a <= i <= b and i)
 
 
+def is_speed_object(element: ET.Element) -> bool:
+    """Whether an <object> is one of CARLA's speed signs."""
+    named = _SPEED_OBJECT.fullmatch(element.get("name", ""))
+    return named is not None and element.get("type", "-1") == "-1"
+
+
 def section_at(road: RoadSpec, s: float) -> SectionSpec:
     """The section that holds s."""
     out = road.sections[0]
@@ -63,7 +69,10 @@ def _spot(element: ET.Element, road: RoadSpec, place: Place, warnings: Warnings)
         a, b = ox.lane_number(e, "fromLane", place), ox.lane_number(e, "toLane", place)
         validity.append((min(a, b), max(a, b)))
     return Spot(
-        road, float(np.clip(s, 0.0, road.length)), element.get("orientation", "none"), tuple(validity)
+        road,
+        float(np.clip(s, 0.0, road.length)),
+        element.get("orientation", "none"),
+        tuple(validity),
     )
 
 
@@ -89,41 +98,47 @@ class SignalReader:
         """All signals of the file.
 
         Args:
-          vendor: header@vendor. RoadRunner up to 2020 ("VectorZero"), with which CARLA's towns were made,
-            writes orientation the other way round: "-" for traffic along s. What the file's own
-            validities say counts more.
+          vendor: header@vendor. RoadRunner up to 2020 ("VectorZero"), with which CARLA's towns were
+            made, writes orientation the other way round: "-" for traffic along s. What the file's
+            own validities say counts more.
 
         Raises:
           MapError: a reference to a signal that is not there.
         """
-        spots: dict[str, list[Spot]] = {}
-        found: list[tuple[ET.Element, Spot, Place]] = []
-        for road in self.roads.values():
-            for e in road.element.findall("signals/signal"):
-                place = road.place.at("signal", e.get("id", "?"))
-                ox.text(e, "id", place)
-                found.append((e, _spot(e, road, place, self.warnings), place))
-            for e in road.element.findall("objects/object"):
-                if _SPEED_OBJECT.fullmatch(e.get("name", "")) and e.get("type", "-1") == "-1":
-                    place = road.place.at("object", e.get("id", "?"))
-                    found.append((e, _spot(e, road, place, self.warnings), place))
+        found = [x for road in self.roads.values() for x in self._own(road)]
         known = {e.get("id", "").strip() for e, _, _ in found}
         if len(known) < len(found):
             self.warnings.add("signals share an id", found[0][2])
+        references = self._references(known)
+        every = [spot for _, spot, _ in found] + [x for s in references.values() for x in s]
+        self.reversed = _writes_orientation_reversed(every, vendor)
+        signals = [
+            self._signal(e, own, references.get(e.get("id", "").strip(), []), place)
+            for e, own, place in found
+        ]
+        return [signal for signal in signals if signal is not None]
+
+    def _own(self, road: RoadSpec) -> list[tuple[ET.Element, Spot, Place]]:
+        """The signals that stand on a road, CARLA's speed objects among them."""
+        elements = road.element.findall("signals/signal")
+        elements += [e for e in road.element.findall("objects/object") if is_speed_object(e)]
+        out = []
+        for e in elements:
+            place = road.place.at(e.tag, e.get("id", "?"))
+            ox.text(e, "id", place)
+            out.append((e, _spot(e, road, place, self.warnings), place))
+        return out
+
+    def _references(self, known: set[str]) -> dict[str, list[Spot]]:
+        """Signal id -> the further places where it holds."""
+        out: dict[str, list[Spot]] = {}
         for road in self.roads.values():
             for e in road.element.findall("signals/signalReference"):
                 name = ox.text(e, "id", road.place.at("signalReference", "?"))
                 place = road.place.at("signalReference", name)
                 if name not in known:
                     raise place.error("refers to a signal that the file does not have")
-                spots.setdefault(name, []).append(_spot(e, road, place, self.warnings))
-        every = [spot for _, spot, _ in found] + [x for s in spots.values() for x in s]
-        self.reversed = _writes_orientation_reversed(every, vendor)
-        out = []
-        for e, own, place in found:
-            signal = self._signal(e, own, spots.get(e.get("id", "").strip(), []), place)
-            if signal is not None:
-                out.append(signal)
+                out.setdefault(name, []).append(_spot(e, road, place, self.warnings))
         return out
 
     def _signal(
@@ -140,7 +155,9 @@ class SignalReader:
         value = None
         if kind == "speed":
             value = float(named[1]) / 3.6 if named else self._limit(element, place)
-        governed = tuple(dict.fromkeys(g for spot in [own, *references] for g in self._governed(spot)))
+        governed = tuple(
+            dict.fromkeys(g for spot in [own, *references] for g in self._governed(spot))
+        )
         t, z = (ox.number(element, a, place, 0.0) for a in ("t", "zOffset"))
         xyz, yaw = pose(own.road, own.s, t, z)
         if governed:
@@ -153,7 +170,7 @@ class SignalReader:
         return Signal(element.get("id", "").strip(), kind, code, name, xyz, yaw, value, governed)
 
     def _limit(self, element: ET.Element, place: Place) -> float | None:
-        """The limit on a sign 274 in m/s: value and unit, else the subtype's number; km/h without unit."""
+        """The limit on a sign 274, m/s: value and unit, else the subtype; km/h without unit."""
         unit = element.get("unit") or "km/h"
         value = ox.speed(element.get("value"), unit, place, self.warnings)
         subtype = element.get("subtype", "")
@@ -168,8 +185,10 @@ class SignalReader:
         return (spot.orientation == "+") != self.reversed
 
     def _governed(self, spot: Spot) -> list[Governed]:
-        """The driving lanes at the spot, by validity and orientation; by validity where they exclude
-        each other."""
+        """The driving lanes at the spot, by validity and orientation.
+
+        Where the two exclude each other validity, the finer statement, holds.
+        """
         section = section_at(spot.road, spot.s)
         lanes = [x for x in section.lanes.values() if x.kind == DRIVING and x.id]
         ids = spot.lane_ids()

@@ -1,4 +1,4 @@
-"""Reading OpenDRIVE's XML safely: numbers with their place in the file, errors of one line, warnings."""
+"""Reading OpenDRIVE's XML safely: numbers and their places, errors of one line, warnings."""
 
 from __future__ import annotations
 
@@ -38,7 +38,8 @@ class Place:
         return dataclasses.replace(self, parts=(*self.parts, part))
 
     def __str__(self) -> str:
-        return f"{self.file}: {', '.join(self.parts)}" if self.parts else self.file
+        file = self.file if self.file.isprintable() else repr(self.file)
+        return f"{file}: {', '.join(self.parts)}" if self.parts else file
 
     def error(self, reason: str) -> MapError:
         """A MapError that names this place."""
@@ -46,7 +47,7 @@ class Place:
 
 
 class Warnings:
-    """Collects what was not read or looks wrong: one line per kind, with a count and the first place."""
+    """Collects what was not read or looks wrong: a line per kind, with count and first place."""
 
     def __init__(self) -> None:
         """Starts empty."""
@@ -67,19 +68,27 @@ class Warnings:
         return tuple(out)
 
 
+def _read(path: pathlib.Path, place: Place) -> bytes:
+    """The bytes of a regular file."""
+    if path.exists() and not path.is_file():
+        raise place.error("is a directory" if path.is_dir() else "is not a regular file")
+    try:
+        data = path.read_bytes()
+    except (OSError, ValueError) as e:
+        raise place.error(f"can't be read: {getattr(e, 'strerror', None) or e}") from None
+    if not data.strip():
+        raise place.error("is empty")
+    return data
+
+
 def parse(path: pathlib.Path, place: Place) -> ET.Element:
     """The root element of an OpenDRIVE file.
 
     Raises:
-      MapError: unreadable, not XML, not OpenDRIVE, or with XML entities of its own (which can blow a
-        small file up to gigabytes; OpenDRIVE has no use for them).
+      MapError: unreadable, not XML, not OpenDRIVE, or with XML entities of its own (which can blow
+        a small file up to gigabytes; OpenDRIVE has no use for them).
     """
-    try:
-        data = path.read_bytes()
-    except OSError as e:
-        raise place.error(f"can't be read: {e.strerror or e}") from None
-    if not data.strip():
-        raise place.error("is empty")
+    data = _read(path, place)
 
     def refuse(name: str, *_: object) -> None:
         raise place.error(f"declares the XML entity {shown(name)}; OpenDRIVE files have none")
@@ -89,11 +98,11 @@ def parse(path: pathlib.Path, place: Place) -> ET.Element:
     try:
         scan.Parse(data, True)
         root = ET.fromstring(data)
+    except MapError:
+        raise
     except (expat.ExpatError, ET.ParseError) as e:
         raise place.error(f"is not well-formed XML: {e}") from None
     except (ValueError, LookupError) as e:  # unknown encodings
-        if isinstance(e, MapError):
-            raise
         raise place.error(f"is not readable XML: {e}") from None
     for element in root.iter():  # drop the namespaces that some exporters declare
         if isinstance(element.tag, str) and element.tag.startswith("{"):
@@ -123,7 +132,9 @@ def number(element: ET.Element, name: str, place: Place, default: float | None =
     except ValueError:
         value = math.nan
     if not abs(value) <= NUMBER_MAX:
-        raise place.error(f"<{element.tag} {name}={shown(raw)}> is not a number to build a road with")
+        raise place.error(
+            f"<{element.tag} {name}={shown(raw)}> is not a number to build a road with"
+        )
     return value
 
 
@@ -152,7 +163,7 @@ _SPEED_UNITS = {"m/s": 1.0, "km/h": 1.0 / 3.6, "kmh": 1.0 / 3.6, "kph": 1.0 / 3.
 
 
 def speed(raw: str | None, unit: str, place: Place, warnings: Warnings) -> float | None:
-    """A speed in m/s; None where the file gives none ("no limit", "undefined", missing, not positive)."""
+    """A speed in m/s; None where there is none ("no limit", "undefined", missing, not positive)."""
     if raw is None or raw.strip() in ("", "no limit", "undefined", "none"):
         return None
     try:

@@ -1,6 +1,7 @@
 """Reference lines of OpenDRIVE roads: cubics over s, and the five planView geometries.
 
-Source: ASAM OpenDRIVE 1.8, sections 8.2-8.7 (line, arc, spiral, poly3, paramPoly3) and 9.2 (cubics).
+Source: ASAM OpenDRIVE 1.8, sections 8.2-8.7 (line, arc, spiral, poly3, paramPoly3) and 9.2
+  (cubics).
 Everything is float64 NumPy over vectors of arc lengths; angles rad, lengths m.
 """
 
@@ -11,7 +12,8 @@ import dataclasses
 import numpy as np
 from scipy.special import fresnel
 
-# Below this change of heading over a piece, its curvature counts as constant (error < length * this).
+# Below this change of heading over a piece, its curvature counts as constant (error < length *
+# this).
 _SPIRAL_EPS = 1e-9
 # Cells of the arc length tables of poly3 and paramPoly3.
 _TABLE_STEP, _TABLE_MIN, _TABLE_MAX = 0.5, 16, 4096
@@ -33,7 +35,8 @@ class Cubics:
     def at(self, s: np.ndarray, pick: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Values and slopes at `s` of the records in force at `pick`; 0 before the first record.
 
-        `pick` differs from `s` at a section's end alone, where the record that ends there still holds.
+        `pick` differs from `s` at a section's end alone, where the record that ends there still
+        holds.
         """
         if not len(self.start):
             return np.zeros_like(s), np.zeros_like(s)
@@ -102,10 +105,11 @@ def planar_curve(u: np.ndarray, v: np.ndarray, p_max: float, length: float | Non
     """Tabulates the arc length of (u(p), v(p)) over p in [0, p_max].
 
     Args:
-      u, v: (4,) coefficients.
+      u: (4,) coefficients along the start's heading.
+      v: (4,) coefficients to its left.
       p_max: end of the parameter's range.
-      length: the length given for this very range (paramPoly3: s is stretched so that the piece ends at
-        p_max), or None where the range only bounds the piece (poly3: s is true arc length).
+      length: the length given for this very range (paramPoly3: s is stretched so that the piece
+        ends at p_max), or None where the range only bounds the piece (poly3: s is true arc length).
     """
     estimate = p_max if length is None else length
     cells = int(np.clip(np.ceil(estimate / _TABLE_STEP), _TABLE_MIN, _TABLE_MAX))
@@ -149,8 +153,8 @@ def _arc_at(ds: np.ndarray, k: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def _spiral_at(ds: np.ndarray, k: np.ndarray, rate: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Local u, v of a clothoid: curvature k at its start, growing by `rate` per metre.
 
-    heading(t) = k t + rate t^2 / 2 = rate / 2 (t + k / rate)^2 - k^2 / (2 rate), so that the position is a
-    difference of Fresnel integrals turned by the constant part.
+    heading(t) = k t + rate t^2 / 2 = rate / 2 (t + k / rate)^2 - k^2 / (2 rate), so that the
+    position is a difference of Fresnel integrals turned by the constant part.
     """
     size = np.sqrt(np.pi / np.abs(rate))
     from_t, sign = k / rate, np.sign(rate)
