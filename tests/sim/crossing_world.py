@@ -1,16 +1,23 @@
 """A town small enough to know by heart: two straight roads that cross at the origin.
 
-Both roads have one lane of 3.5 m each way, keep to the right and run 100 m from the crossing, which is
-the square of 20 m around the origin. The road along x has a broken centre line, solid outer lines and,
-south of its western arm, a shoulder of 2 m; the road along y has a parking lane of 2 m on its east side,
-north of the crossing. There is no paint inside the crossing.
+Both roads have one lane of 3.5 m each way, keep to the right and run 100 m from the crossing, which
+is the square of 20 m around the origin. The road along x has a broken centre line, solid outer
+lines and, south of its western arm, a shoulder of 2 m; the road along y has a parking lane of 2 m
+on its east side, north of the crossing. There is no paint inside the crossing.
 """
 
 from __future__ import annotations
 
+import dataclasses
+
+import jax.numpy as jnp
 import numpy as np
 
+from carljax.sim import atlas
+from carljax.sim.road_map import RoadMap
 from carljax.sim.road_network import MARK_BROKEN, MARK_SOLID, Lane, RoadMark, RoadNetwork
+from carljax.sim.route import Route
+from carljax.sim.types import Agents, EgoState
 
 
 def lane(start, end, width=3.5, kind="driving", junction=None) -> Lane:
@@ -66,3 +73,63 @@ def network() -> RoadNetwork:
         crosswalks=(),
         stop_lines=(),
     )
+
+
+def road_map() -> RoadMap:
+    """Two towns: an empty one and the crossing. Only what the rasterizer reads is filled in."""
+    net = network()
+    origin, shape = atlas.frame(net)
+    layers = np.stack([np.zeros(shape, np.uint8), atlas.layers(net, origin, shape)])
+    rest = {field.name: jnp.zeros(0) for field in dataclasses.fields(RoadMap)}
+    rest |= {"layers": jnp.asarray(layers), "origin": jnp.asarray([[0.0, 0.0], origin])}
+    return RoadMap(**rest)
+
+
+def ego_at(x: float, y: float, yaw: float = 0.0, **rest: float) -> EgoState:
+    """The ego; what isn't named is zero."""
+    values = {field.name: jnp.float32(0.0) for field in dataclasses.fields(EgoState)}
+    values |= {name: jnp.float32(value) for name, value in rest.items()}
+    return EgoState(**values | {"xy": jnp.array([x, y], jnp.float32), "yaw": jnp.float32(yaw)})
+
+
+def agents_of(*users: dict[str, float], slots: int = 8) -> Agents:
+    """Road users by x, y, yaw, length, width, kind, speed, ...; other slots are empty."""
+
+    def column(name: str) -> np.ndarray:
+        return np.array([user.get(name, 0.0) for user in users] + [0.0] * (slots - len(users)))
+
+    values = {
+        field.name: column(field.name).astype(np.float32) for field in dataclasses.fields(Agents)
+    }
+    values["xy"] = np.stack([column("x"), column("y")], axis=-1).astype(np.float32)
+    values["kind"] = column("kind").astype(np.int32)
+    values["lanes"] = np.full((slots, 3), -1, np.int32)
+    values["has_stopped"] = np.zeros(slots, bool)
+    return Agents(**{name: jnp.asarray(value) for name, value in values.items()})
+
+
+def route_east(start: float = -100.0, num: int = 201, **rest) -> Route:
+    """A route along y = -1.75 with a point a metre, through the crossing, in town 1."""
+    x = start + np.arange(num)
+    values = {field.name: np.zeros(num) for field in dataclasses.fields(Route)}
+    values |= {
+        "xy": np.stack([x, np.full(num, -1.75)], axis=-1),
+        "s": x - start,
+        "speed_limit": np.full(num, 8.0),
+        "in_junction": np.abs(x) <= 10.0,
+        "num_points": np.int32(num),
+        "length": np.float32(num - 1),
+        "town": np.int32(1),
+        "stop_idx": np.full(4, -1, np.int32),
+        "stop_xy": np.zeros((4, 2)),
+        "stop_yaw": np.zeros(4),
+        "stop_s": np.zeros(4),
+        "stop_kind": np.zeros(4, np.int32),
+        "stop_light": np.full(4, -1, np.int32),
+        "stop_width": np.zeros(4),
+        "sign_xy": np.zeros((3, 2)),
+        "sign_idx": np.full(3, -1, np.int32),
+        "sign_limit": np.zeros(3),
+    } | rest
+    floats = {name: v.astype(np.float32) for name, v in values.items() if v.dtype == np.float64}
+    return Route(**{name: jnp.asarray(value) for name, value in (values | floats).items()})
