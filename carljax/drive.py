@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import functools
+from collections.abc import Callable
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 
-from carljax.ppo import beta
+from carljax.ppo import beta, trainer
 from carljax.ppo.networks import ActorCritic
 from carljax.sim.env import DrivingEnv
 from carljax.sim.types import Observation, State
@@ -47,13 +49,13 @@ def start(env: DrivingEnv, scenarios: jax.Array, key: jax.Array) -> State:
 
 
 def step(
-    env: DrivingEnv, network: ActorCritic, params: Any, state: State
+    network: ActorCritic, env: DrivingEnv, params: Any, state: State
 ) -> tuple[State, jax.Array]:
     """Makes one step; ended episodes stay as they ended.
 
     Args:
-      env: the environment.
       network: actor and critic.
+      env: the environment.
       params: its variables.
       state: (B,) states.
 
@@ -68,3 +70,18 @@ def step(
         return env.observe(kept)
 
     return jax.vmap(one)(state.replace(obs=None), command), command
+
+
+@functools.cache
+def compiled(function: Callable[..., Any], network: ActorCritic) -> Callable[..., Any]:
+    """Jits a function of a network once per process, with the options of the train step.
+
+    Args:
+      function: takes the network first, then arrays.
+      network: actor and critic.
+
+    Returns:
+      The jitted function of the arrays.
+    """
+    options = trainer.compiler_options(jax.default_backend())
+    return jax.jit(functools.partial(function, network), compiler_options=options)

@@ -24,7 +24,6 @@ from rich.console import Console
 from carljax import atomic, build, checkpoint, drive, machine, run_dir, scores
 from carljax.checkpoint import CheckpointError
 from carljax.config import HELD_OUT_SEED, ConfigError, TrainConfig
-from carljax.ppo import trainer
 from carljax.ppo.networks import ActorCritic
 from carljax.render import gif
 from carljax.reward import collision
@@ -32,6 +31,7 @@ from carljax.scores import EvalResult, RouteScore
 from carljax.sim.env import DrivingEnv
 from carljax.sim.road_network import MapError
 from carljax.sim.route_generator import RouteError
+from carljax.sim.town import Town
 from carljax.sim.types import KIND_PEDESTRIAN, KIND_STATIC, KIND_VEHICLE, State
 
 FILE = "evaluation.json"
@@ -42,6 +42,11 @@ COLLISIONS = {
     "static_collision": KIND_STATIC,
 }
 CAUSES = ("red_light", "stop_sign", "off_road", "route_deviation", "blocked", "timeout")
+
+
+def held_out(config: TrainConfig, towns: Sequence[Town], num_routes: int) -> DrivingEnv:
+    """Makes the environment with the routes that are kept for scoring, always the same ones."""
+    return build.environment(config, towns, num_routes, HELD_OUT_SEED)
 
 
 def evaluate(
@@ -58,9 +63,8 @@ def evaluate(
     Returns:
       The scores.
     """
-    options = trainer.compiler_options(jax.default_backend())
-    run = jax.jit(functools.partial(_drive_all, network=network), compiler_options=options)
-    metrics, collisions = jax.device_get(run(env, jax.device_get(params)))
+    drive_all = drive.compiled(_drive_all, network)
+    metrics, collisions = jax.device_get(drive_all(env, jax.device_get(params)))
     towns = np.asarray(env.bank.routes.town)
     names = town_names or [str(number) for number in range(towns.max() + 1)]
     lengths = np.max(np.asarray(env.bank.routes.s), axis=1)
@@ -87,7 +91,7 @@ def evaluate(
 
 
 def _drive_all(
-    env: DrivingEnv, params: Any, network: ActorCritic
+    network: ActorCritic, env: DrivingEnv, params: Any
 ) -> tuple[dict[str, jax.Array], dict[str, jax.Array]]:
     """Drives until all episodes have ended; metrics of their last steps, collisions by kind."""
 
@@ -95,15 +99,15 @@ def _drive_all(
         return jnp.any(state.done == 0)
 
     def again(state: State) -> State:
-        return drive.step(env, network, params, state)[0]
+        return drive.step(network, env, params, state)[0]
 
     scenarios = jnp.arange(env.bank.num_scenarios)
     state = drive.start(env, scenarios, jax.random.key(TRAFFIC_SEED))
     state = jax.lax.while_loop(is_any_running, again, state)
-    return state.metrics, jax.vmap(functools.partial(_collided_kinds, env))(state)
+    return state.metrics, jax.vmap(functools.partial(collided_kinds, env))(state)
 
 
-def _collided_kinds(env: DrivingEnv, state: State) -> dict[str, jax.Array]:
+def collided_kinds(env: DrivingEnv, state: State) -> dict[str, jax.Array]:
     """Which kinds of road user the ego touches, {name: () bool}; unbatched."""
     sim = state.pipeline_state
     touched = collision.touched(sim.ego, sim.agents, env.vehicle, env.reward_config.z_gap)
@@ -186,7 +190,7 @@ def run(command: Command, console: Console) -> int:
     path, update = run_dir.split_checkpoint(command.checkpoint)
     config = run_dir.load_config(path)
     towns = build.load_towns(command.maps or config.run.maps)
-    env = build.environment(config, towns, command.num_routes, HELD_OUT_SEED)
+    env = held_out(config, towns, command.num_routes)
     network = ActorCritic(config.network)
     params, update = _load_params(command, path, update, config, env)
     result = evaluate(env, network, params, [town.network.name for town in towns])

@@ -15,7 +15,7 @@ from rich.console import Console
 from carljax import build, checkpoint, config, evaluate, learn, memory, presets, run_dir, scores
 from carljax.build import Setup
 from carljax.checkpoint import CheckpointError
-from carljax.config import HELD_OUT_SEED, ConfigError, TrainConfig
+from carljax.config import ConfigError, TrainConfig
 from carljax.sim.road_network import MapError
 from carljax.sim.route_generator import RouteError
 
@@ -105,7 +105,7 @@ def run(command: Command, console: Console) -> int:
     maps = tuple(file.resolve() for file in wanted.run.maps)
     wanted = _with_run(wanted, dir=path, maps=maps)
     if wanted.run.compile_cache is not None:
-        jax.config.update("jax_compilation_cache_dir", str(wanted.run.compile_cache))
+        jax.config.update("jax_compilation_cache_dir", str(wanted.run.compile_cache.resolve()))
     if command.resume is None:
         run_dir.check_free(path)
     made = build.setup(wanted)
@@ -130,7 +130,7 @@ def run(command: Command, console: Console) -> int:
 
 def score(made: Setup, params: Any, path: Path, console: Console) -> None:
     """Evaluates the policy on held-out routes; prints the table and writes evaluation.json."""
-    env = build.environment(made.config, made.towns, made.config.run.eval_routes, HELD_OUT_SEED)
+    env = evaluate.held_out(made.config, made.towns, made.config.run.eval_routes)
     names = [town.network.name for town in made.towns]
     result = evaluate.evaluate(env, made.network, params, names)
     scores.show(result, console)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -13,7 +12,6 @@ import numpy as np
 from PIL import Image
 
 from carljax import drive
-from carljax.ppo import trainer
 from carljax.ppo.networks import ActorCritic
 from carljax.render.episode_view import frame, read_world
 from carljax.sim.env import DrivingEnv
@@ -66,12 +64,11 @@ def episode(
     Yields:
       The unbatched state on the host, and the (2,) action that led to it.
     """
-    options = trainer.compiler_options(jax.default_backend())
-    step = jax.jit(functools.partial(drive.step, network=network), compiler_options=options)
+    step = drive.compiled(drive.step, network)
     params = jax.device_get(params)
     state = jax.jit(drive.start)(env, jnp.array([scenario]), jax.random.key(seed))
     for number in range(1, MAX_FRAMES * FRAME_EVERY + 1):
-        state, command = step(env, params=params, state=state)
+        state, command = step(env, params, state)
         is_last = float(state.done[0]) > 0
         if is_last or number % FRAME_EVERY == 0:
             one = jax.tree.map(lambda x: x[0], state.replace(pipeline_state=_keyless(state)))
