@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -89,6 +90,10 @@ _CODE_VEHICLE, _CODE_BRAKE, _CODE_STATIC, _CODE_PEDESTRIAN = 1, 130, 131, 132
 # holds a circle of diameter 1, and that is the diagonal of the sample grid's cell).
 _SAMPLE_STEP = 0.7  # px
 
+# No index here is negative, and saying so makes the gather over the atlas a fifth faster.
+_GATHER: dict[str, Any] = {"mode": "promise_in_bounds", "wrap_negative_indices": False}
+_SCATTER: dict[str, Any] = {"mode": "drop", "wrap_negative_indices": False}
+
 
 @dataclasses.dataclass(frozen=True)
 class RasterConfig:
@@ -158,7 +163,7 @@ def render(
     ground = _route(_static(ego, road_map, route, config), ego, route, route_idx, config)
     users = _road_users(ego, agents, config)
     index = users.astype(jnp.int32) << _NUM_BITS | ground.astype(jnp.int32)
-    image = jnp.asarray(_TABLE).at[index].get(mode="promise_in_bounds")
+    image = jnp.asarray(_TABLE).at[index].get(**_GATHER)
     image = _lights(image, ego, route, route_idx, light_state, light_time_left, config)
     image = _stop_sign(image, ego, route, route_idx, stop_satisfied, config)
     image = _speed_signs(image, ego, route, route_idx, config)
@@ -238,20 +243,21 @@ def _static_at(
 ) -> jax.Array:
     """(H, W) uint8: the atlas at each pixel's centre, or so many pixels down and right of it."""
     _, rows, columns = road_map.layers.shape
-    scale = PIXELS_PER_METRE / config.pixels_per_metre
     # Iota, not constants: with constants XLA's CPU code for this gather is eight times slower.
-    row = jnp.arange(config.height, dtype=jnp.float32)[:, None] + np.float32(0.5 + down)
-    column = jnp.arange(config.width, dtype=jnp.float32)[None, :] + np.float32(0.5 + right)
-    ahead = (config.height - config.ego_from_bottom_px - row) * np.float32(scale)
-    left = (config.width / 2 - column) * np.float32(scale)
-    cos, sin = jnp.cos(ego.yaw), jnp.sin(ego.yaw)
+    row = jnp.arange(config.height, dtype=jnp.float32)[:, None]
+    column = jnp.arange(config.width, dtype=jnp.float32)[None, :]
+    ahead = np.float32(config.height - config.ego_from_bottom_px - 0.5 - down) - row
+    left = np.float32(config.width / 2 - 0.5 - right) - column
+    scale = np.float32(PIXELS_PER_METRE / config.pixels_per_metre)
+    cos, sin = jnp.cos(ego.yaw) * scale, jnp.sin(ego.yaw) * scale
     # The half makes the floor below a rounding.
     at = (ego.xy - road_map.origin[route.town]) * PIXELS_PER_METRE + 0.5
-    x = jnp.floor((at[0] + cos * ahead) - sin * left).astype(jnp.int32)
-    y = jnp.floor((at[1] + sin * ahead) + cos * left).astype(jnp.int32)
-    inside = (x >= 0) & (x < columns) & (y >= 0) & (y < rows)
+    x = jnp.floor(at[0] + cos * ahead - sin * left).astype(jnp.int32)
+    y = jnp.floor(at[1] + sin * ahead + cos * left).astype(jnp.int32)
+    # Unsigned, a negative number is larger than any size.
+    inside = (x.astype(jnp.uint32) < columns) & (y.astype(jnp.uint32) < rows)
     index = jnp.where(inside, (route.town * rows + y) * columns + x, 0)
-    bits = road_map.layers.reshape(-1).at[index].get(mode="promise_in_bounds")
+    bits = road_map.layers.reshape(-1).at[index].get(**_GATHER)
     return jnp.where(inside, bits & jnp.uint8(_BIT_ROUTE - 1), jnp.uint8(0))
 
 
@@ -275,7 +281,7 @@ def _route(
         shown[:, None],
         config,
     )
-    return ground.at[index].apply(lambda bits: bits | jnp.uint8(_BIT_ROUTE), mode="drop")
+    return ground.at[index].apply(lambda bits: bits | jnp.uint8(_BIT_ROUTE), **_SCATTER)
 
 
 def _road_users(ego: EgoState, agents: Agents, config: RasterConfig) -> jax.Array:
@@ -295,7 +301,7 @@ def _road_users(ego: EgoState, agents: Agents, config: RasterConfig) -> jax.Arra
     canvas = jnp.zeros(config.height * config.width, jnp.uint8)
     limits = (config.agent_length_max, config.agent_width_max)
     index = _box(agents.xy, turn, length, width, shown, limits, ego, config)
-    canvas = canvas.at[index].max(code[:, None], mode="drop")
+    canvas = canvas.at[index].max(code[:, None], **_SCATTER)
 
     row, column = _pixel(agents.xy, ego, config)
     farthest = (SPEED_RANGE - SPEED_OFFSET) * FORECAST_S * px
@@ -309,14 +315,14 @@ def _road_users(ego: EgoState, agents: Agents, config: RasterConfig) -> jax.Arra
         drawn,
         config,
     )
-    canvas = canvas.at[index].max(code[:, None], mode="drop")
+    canvas = canvas.at[index].max(code[:, None], **_SCATTER)
 
     rear = jnp.stack([jnp.cos(agents.yaw), jnp.sin(agents.yaw)], axis=-1) * BRAKE_LIGHT_X
     side = jnp.full_like(length, BRAKE_LIGHT_SIDE)
     brakes = shown & is_vehicle & (agents.accel < BRAKE_LIGHT_ACCEL)
     limits = (BRAKE_LIGHT_SIDE, BRAKE_LIGHT_SIDE)
     index = _box(agents.xy + rear, turn, side, side, brakes, limits, ego, config)
-    return canvas.at[index].max(jnp.uint8(_CODE_BRAKE), mode="drop")
+    return canvas.at[index].max(jnp.uint8(_CODE_BRAKE), **_SCATTER)
 
 
 def _lights(
@@ -396,7 +402,7 @@ def _speed_signs(
 def _draw(image: jax.Array, index: jax.Array, channel: int, value: jax.Array) -> jax.Array:
     """Scatters values (K,) to pixels (K, S) of one channel of the (H * W, 10) image."""
     value = value.astype(jnp.uint8)[:, None]
-    return image.at[index, channel].max(value, mode="drop")
+    return image.at[index, channel].max(value, **_SCATTER)
 
 
 def _pixel(xy: jax.Array, ego: EgoState, config: RasterConfig) -> tuple[jax.Array, jax.Array]:
@@ -409,7 +415,8 @@ def _pixel(xy: jax.Array, ego: EgoState, config: RasterConfig) -> tuple[jax.Arra
 def _index(row: jax.Array, column: jax.Array, shown: jax.Array, config: RasterConfig) -> jax.Array:
     """Flat pixel index, int32; one past the image for what is outside or not shown."""
     row, column = jnp.floor(row).astype(jnp.int32), jnp.floor(column).astype(jnp.int32)
-    shown = shown & (row >= 0) & (row < config.height) & (column >= 0) & (column < config.width)
+    shown = shown & (row.astype(jnp.uint32) < config.height)
+    shown &= column.astype(jnp.uint32) < config.width
     return jnp.where(shown, row * config.width + column, config.height * config.width)
 
 
