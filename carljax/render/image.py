@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import jax
 import numpy as np
 
 from carljax.sim.rasterizer import BRAKE_LIGHT_VALUE, CHANNELS, GREEN_VALUE, RasterConfig
@@ -40,7 +41,7 @@ EGO_SIZE = (4.892, 1.836)  # m; source: `bicycle.VehicleParams`, CARLA's saloon
 
 
 def bev_image(
-    raster: np.ndarray,
+    raster: np.ndarray | jax.Array,
     config: RasterConfig,
     scale: int = 1,
     ego_size: tuple[float, float] = EGO_SIZE,
@@ -87,7 +88,7 @@ def bev_image(
     return picture
 
 
-def map_image(layers: np.ndarray, scale: int = 1) -> np.ndarray:
+def map_image(layers: np.ndarray | jax.Array, scale: int = 1) -> np.ndarray:
     """Colours a town's atlas or a piece of it, north up.
 
     Args:

@@ -121,7 +121,7 @@ def test_an_environment_shows_the_route_from_where_the_ego_is():
     )
     seen = jax.jit(observation.observe)(env, sim)
     # The environment looks at a window of the route; the whole route gives the same image.
-    whole = rasterizer.render(
+    whole = jax.jit(rasterizer.render, static_argnames="config")(
         sim.ego,
         sim.agents,
         bank.road_map,
@@ -130,7 +130,7 @@ def test_an_environment_shows_the_route_from_where_the_ego_is():
         situation.stop_lights(bank.road_map, route, sim.light_time),
         situation.yellow_left(bank.road_map, route, sim.light_time),
         memory.stop_satisfied,
-        config,
+        config=config,
     )
     assert (np.asarray(seen.raster) != np.asarray(whole)).any(axis=-1).sum() <= 4
     drawn = np.asarray(seen.raster)[..., CHANNELS.index("route")]

@@ -229,6 +229,20 @@ def test_lights_far_behind_or_ahead_and_other_stop_lines_are_not_lights(world):
     assert draw(world, ego_at(-19.05, -1.85), route=route, idx=100)[..., LIGHTS].any()
 
 
+def test_a_light_is_drawn_up_to_149_route_points_ahead(world):
+    route = stops([STOP_LIGHT], [90])  # a winding route: near, but far along it
+    for ahead, seen in ((149, True), (150, False)):
+        bent = route.replace(stop_idx=jnp.array([70 + ahead]))
+        image = draw(world, ego_at(-30.05, -1.85), route=bent, idx=70)
+        assert image[..., LIGHTS].any() == seen
+
+
+def test_150_route_points_are_looked_at_or_what_a_small_image_can_show():
+    assert CONFIG.num_route_points == 150
+    # The farthest corner is hypot(48, 32) = 57.7 m away: 1.5 times that.
+    assert SMALL.num_route_points == 87
+
+
 def test_only_the_next_stop_sign_that_asks_for_a_halt_is_drawn(world):
     route = stops([STOP_SIGN, STOP_SIGN, STOP_LIGHT, STOP_SIGN], [88, 80, 75, 140])
     ego = ego_at(-30.05, -1.85)
