@@ -10,7 +10,6 @@ from carljax.sim.road_network import Lane, RoadNetwork
 from carljax.sim.types import STOP_LIGHT, STOP_NONE, STOP_SIGN, STOP_YIELD
 
 POINT_SPACING = 1.0  # m
-MAX_SUCCESSORS = 4
 LATERAL_ACCEL = 2.5  # m/s^2 in bends. source: ours, a comfortable value for traffic
 DEFAULT_SPEED_LIMIT = (
     50.0 / 3.6
@@ -192,11 +191,12 @@ def _curve_speed(yaw: np.ndarray, length: float) -> float:
 
 
 def _successors(network: RoadNetwork, chains: list[list[int]], raw_lane: np.ndarray) -> np.ndarray:
-    out = np.full((len(chains), MAX_SUCCESSORS), -1)
-    for row, chain in enumerate(chains):
-        following = [int(raw_lane[b]) for b in network.lanes[chain[-1]].successors]
-        following = sorted(set(following))[:MAX_SUCCESSORS]
-        out[row, : len(following)] = following
+    following = [
+        sorted({int(raw_lane[b]) for b in network.lanes[chain[-1]].successors}) for chain in chains
+    ]
+    out = np.full((len(chains), max(1, *(len(rows) for rows in following))), -1)
+    for row, onward in enumerate(following):
+        out[row, : len(onward)] = onward
     return out
 
 

@@ -11,6 +11,8 @@ from carljax.sim.lane_table import LaneTable
 from carljax.sim.road_network import RoadNetwork
 from carljax.sim.types import STOP_LIGHT
 
+JUNCTION_REACH = 60.0  # m beyond a light's lane in which its junction is looked for. source: ours
+
 
 @dataclasses.dataclass(frozen=True)
 class LightTable:
@@ -52,12 +54,17 @@ def build(network: RoadNetwork, table: LaneTable) -> LightTable:
 
 
 def _junction_of(table: LaneTable, lane: int) -> str:
-    """The junction a light belongs to: that of its lane or of the lane's first successor."""
-    name = table.junction[lane]
-    following = table.successors[lane][table.successors[lane] >= 0]
-    if name is None and len(following):
-        name = table.junction[int(following[0])]
-    return name if name is not None else f"lane {lane}"
+    """The junction a light belongs to: that of its lane or else the first one ahead."""
+    seen, ahead = {lane}, [(lane, 0.0)]
+    for row, distance in ahead:  # grows: nearer lanes, counted in lanes, come first
+        name = table.junction[row]
+        if name is not None:
+            return name
+        beyond = distance + (float(table.length[row]) if row != lane else 0.0)
+        new = {int(n) for n in table.successors[row] if n >= 0 and beyond < JUNCTION_REACH} - seen
+        seen |= new
+        ahead += [(n, beyond) for n in sorted(new)]
+    return f"lane {lane}"
 
 
 def _sequence(network: RoadNetwork, junction: str, group: str) -> tuple[int, int, str]:

@@ -33,7 +33,7 @@ class RoadMap:
       lane_length: (K,) m; points are evenly spaced, about 1 m apart.
       lane_speed_limit: (K,) m/s.
       lane_curve_speed: (K,) m/s, speed at which the lane's sharpest bend is comfortable.
-      lane_successors: (K, 4) int32, -1 pads.
+      lane_successors: (K, F) int32, F the most ways on from any lane; -1 pads.
       lane_in_junction: (K,) bool.
       lane_junction: (K,) int32, running index of its junction, -1 outside.
       lane_slot: (K,) int32, place among the lanes of its junction, 0 outside.

@@ -38,9 +38,15 @@ def _shift(index: np.ndarray, offset: int) -> np.ndarray:
     return np.where(index >= 0, index + offset, index)
 
 
+def _widen(rows: np.ndarray, columns: int, fill: int) -> np.ndarray:
+    """Pads rows on the right."""
+    return np.pad(rows, ((0, 0), (0, columns - rows.shape[1])), constant_values=fill)
+
+
 def _lane_arrays(towns: Sequence[Town]) -> dict[str, np.ndarray]:
     rows: dict[str, list[np.ndarray]] = {}
     slots = max(t.junctions.conflict.shape[1] for t in towns)
+    forks = max(t.lanes.successors.shape[1] for t in towns)
     for town, first in zip(towns, offsets(towns), strict=True):
         table, cross, light = town.lanes, town.junctions, town.lights
         # Forks are named by their first lane; lanes without one got negative names of their own.
@@ -51,11 +57,11 @@ def _lane_arrays(towns: Sequence[Town]) -> dict[str, np.ndarray]:
             "lane_length": table.length,
             "lane_speed_limit": table.speed_limit,
             "lane_curve_speed": table.curve_speed,
-            "lane_successors": _shift(table.successors, first.lane),
+            "lane_successors": _widen(_shift(table.successors, first.lane), forks, -1),
             "lane_in_junction": cross.junction >= 0,
             "lane_junction": _shift(cross.junction, first.junction),
             "lane_slot": cross.slot,
-            "lane_conflict": np.pad(cross.conflict, ((0, 0), (0, slots - cross.conflict.shape[1]))),
+            "lane_conflict": _widen(cross.conflict, slots, 0),
             "lane_fork": fork,
             "lane_stop_s": table.stop_s,
             "lane_stop_kind": table.stop_kind,

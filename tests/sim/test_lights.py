@@ -1,0 +1,129 @@
+"""Traffic lights: one cycle by hand, and who is green together."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from small_world import ARMS, approach, crossing, inner, link, network, signal, straight
+
+from carljax.sim import lane_table, light_table, lights, town, towns
+from carljax.sim.road_network import Controller
+from carljax.sim.types import LIGHT_GREEN, LIGHT_RED, LIGHT_YELLOW
+
+G, Y, R = LIGHT_GREEN, LIGHT_YELLOW, LIGHT_RED
+
+
+def f32(*values):
+    return jnp.asarray(values, jnp.float32)
+
+
+@pytest.mark.parametrize("variant", [lambda f: f, jax.jit])
+def test_a_cycle_by_hand(variant):
+    # Two lights of a cycle of 30 s. Green 10 s, yellow 3 s, red for the rest.
+    times = [0.0, 9.9, 10.1, 12.9, 13.1, 14.9, 15.1, 24.9, 25.1, 27.9, 28.1, 29.9, 30.1]
+    first = [G, G, Y, Y, R, R, R, R, R, R, R, R, G]
+    second = [R, R, R, R, R, R, G, G, Y, Y, R, R, R]
+    state = variant(lights.state)
+    np.testing.assert_array_equal(state(f32(*times), f32(0.0), f32(30.0)), first)
+    np.testing.assert_array_equal(state(f32(*times), f32(15.0), f32(30.0)), second)
+    assert state(f32(1.0), f32(0.0), f32(30.0)).dtype == jnp.int32
+
+
+def test_yellow_left_by_hand():
+    # 3 s until yellow begins at 10 s, then 3 - (t - 10), 0 from 13 s to the cycle's end.
+    times = [0.0, 9.0, 10.0, 11.0, 12.5, 13.0, 20.0, 29.5, 30.0]
+    left = lights.yellow_left(f32(*times), f32(0.0), f32(30.0))
+    np.testing.assert_allclose(left, [3, 3, 3, 2, 0.5, 0, 0, 0, 3], atol=1e-5)
+
+
+def test_any_number_of_cycles_later_nothing_has_changed():
+    times = np.arange(0.05, 45.0, 0.1)
+    now = lights.state(f32(*times), f32(7.5), f32(45.0))
+    later = lights.state(f32(*(times + 40 * 45.0)), f32(7.5), f32(45.0))
+    np.testing.assert_array_equal(now, later)
+    assert np.bincount(now).tolist() == [100, 30, 320]  # 10 s, 3 s, 32 s
+
+
+def tables(net):
+    table = lane_table.build(net)
+    return table, light_table.build(net, table)
+
+
+def test_groups_of_a_crossing_take_turns_in_the_order_of_the_file():
+    groups = [("north", "south"), ("east",), ("west",)]
+    table, found = tables(crossing(dict.fromkeys(ARMS, "light"), groups))
+    light = {arm: found.lane_light[table.raw_lane[inner(arm, "left")]] for arm in ARMS}
+    assert light["north"] == light["south"] and len(set(light.values())) == 3
+    # three slots of 10 + 3 + 2 s
+    np.testing.assert_allclose(found.cycle, [45, 45, 45])
+    starts = [float(found.start[light[arm]]) for arm in ("north", "east", "west")]
+    np.testing.assert_allclose(np.mod(np.diff(starts), 45), [15, 15])
+    assert (found.lane_light[[table.raw_lane[approach(arm)] for arm in ARMS]] == -1).all()
+
+
+def test_the_order_may_come_from_the_controllers_sequence():
+    net = crossing(dict.fromkeys(ARMS[:2], "light"))
+    sequences = {"a": Controller("a", 7, ("east",)), "b": Controller("b", 2, ("north",))}
+    table, found = tables(dataclasses.replace(net, controllers=sequences))
+    light = {arm: found.lane_light[table.raw_lane[inner(arm, "left")]] for arm in ARMS[:2]}
+    starts = found.start[[light["north"], light["east"]]]
+    np.testing.assert_allclose(np.mod(np.diff(starts), 30), [15])  # b before a, one slot apart
+
+
+def test_lights_without_a_controller_switch_one_by_one():
+    table, found = tables(crossing(dict.fromkeys(ARMS, "light")))
+    light = [found.lane_light[table.raw_lane[inner(arm, "straight")]] for arm in ARMS]
+    assert len(set(light)) == 4
+    np.testing.assert_allclose(found.cycle, 60.0)
+
+
+def test_a_single_light_is_not_green_for_ever():
+    table, found = tables(crossing({"east": "light"}))
+    np.testing.assert_allclose(found.cycle, [30.0])
+
+
+def test_a_light_before_the_junction_takes_turns_with_those_inside():
+    # The line of one arm lies on its approach, with another piece of road between it and the
+    # junction; that of the other arm on the lanes inside.
+    lanes = [
+        straight((-40, 0), (-20, 0)),
+        straight((-20, 0), (-5, 0), speed_limit=5.0),
+        straight((-5, 0), (5, 0), junction="9"),
+        straight((0, -5), (0, 5), junction="9"),
+    ]
+    signals = [signal("a", "light", [(0, 18)]), signal("b", "light", [(3, 0)])]
+    table, found = tables(network(link(lanes, [(0, 1), (1, 2)]), signals))
+    light = found.lane_light[[table.raw_lane[0], table.raw_lane[3]]]
+    assert light[0] != light[1]
+    np.testing.assert_allclose(found.cycle, [30, 30])
+    np.testing.assert_allclose(np.mod(found.start[light[0]] - found.start[light[1]], 30), 15)
+
+
+def test_a_town_without_lights_still_has_a_table():
+    _, found = tables(crossing())
+    assert (found.lane_light == -1).all() and len(found.cycle) == len(found.start) == 1
+
+
+@pytest.mark.parametrize("name", towns.names())
+def test_one_group_at_a_time_goes_in_bundled_towns(name):
+    found = town.load(towns.path(name))
+    lit = np.flatnonzero(found.lights.lane_light >= 0)
+    junction_of = {}
+    for lane in lit:
+        # the junction of the lane itself or of the first one ahead
+        row = int(lane)
+        while found.lanes.junction[row] is None:
+            row = int(found.lanes.successors[row, 0])
+        junction_of[int(found.lights.lane_light[lane])] = found.lanes.junction[row]
+    for junction in set(junction_of.values()):
+        rows = np.array([light for light, name in junction_of.items() if name == junction])
+        cycle = found.lights.cycle[rows]
+        assert len(set(cycle)) == 1
+        times = jnp.arange(0.05, cycle[0], 0.1, dtype=jnp.float32)[:, None]
+        start = jnp.asarray(found.lights.start[rows], jnp.float32)
+        state = np.asarray(lights.state(times, start, jnp.asarray(cycle, jnp.float32)))
+        assert ((state != LIGHT_RED).sum(axis=1) <= 1).all()
+        green = (state == LIGHT_GREEN).sum(axis=0)
+        np.testing.assert_allclose(green, 100, atol=1)  # each has its 10 s
