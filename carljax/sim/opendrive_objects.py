@@ -42,8 +42,8 @@ def _frame(element: ET.Element, road: RoadSpec, place: Place) -> tuple[np.ndarra
 
 
 def _open(polygon: np.ndarray) -> np.ndarray:
-    """Without corners that repeat the one before, the closing one included."""
-    keep = np.linalg.norm(polygon - np.roll(polygon, 1, axis=0), axis=1) > _SAME
+    """Without corners that the next one repeats, a closing one included."""
+    keep = np.linalg.norm(polygon - np.roll(polygon, -1, axis=0), axis=1) > _SAME
     return polygon[keep]
 
 

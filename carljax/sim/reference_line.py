@@ -94,11 +94,16 @@ def _cubic(coeff: np.ndarray, p: np.ndarray) -> tuple[np.ndarray, np.ndarray, np
     return a + p * (b + p * (c + p * d)), b + p * (2 * c + p * 3 * d), 2 * c + p * 6 * d
 
 
+def _slope(coeff: np.ndarray, p: np.ndarray) -> np.ndarray:
+    """First derivative of a cubic."""
+    return coeff[1] + p * (2 * coeff[2] + p * (3 * coeff[3]))
+
+
 def _arc_between(u: np.ndarray, v: np.ndarray, p0: np.ndarray, p1: np.ndarray) -> np.ndarray:
     """Arc lengths from each p0 to its p1 by 6-point Gauss-Legendre quadrature."""
     half = (p1 - p0) / 2
     p = (p0 + p1)[:, None] / 2 + half[:, None] * _GAUSS_X
-    return half * (np.hypot(_cubic(u, p)[1], _cubic(v, p)[1]) @ _GAUSS_W)
+    return half * (np.hypot(_slope(u, p), _slope(v, p)) @ _GAUSS_W)
 
 
 def planar_curve(u: np.ndarray, v: np.ndarray, p_max: float, length: float | None) -> PlanarCurve:
@@ -128,7 +133,7 @@ def _parameter_at(curve: PlanarCurve, ds: np.ndarray) -> np.ndarray:
     step = curve.p[1] - curve.p[0]
     p = p0 + (arc - arc0) / cell * step
     for _ in range(3):
-        speed = np.hypot(_cubic(curve.u, p)[1], _cubic(curve.v, p)[1])
+        speed = np.hypot(_slope(curve.u, p), _slope(curve.v, p))
         miss = arc - arc0 - _arc_between(curve.u, curve.v, p0, p)
         p = np.clip(p + miss / np.maximum(speed, 1e-9), p0 - step, p0 + 2 * step)
     return p
