@@ -76,12 +76,12 @@ def network() -> RoadNetwork:
 
 
 def road_map() -> RoadMap:
-    """Two towns: an empty one and the crossing. Only what the rasterizer reads is filled in."""
+    """Two towns in one place: an empty one and the crossing. Only what the rasterizer reads is filled in."""
     net = network()
     origin, shape = atlas.frame(net)
     layers = np.stack([np.zeros(shape, np.uint8), atlas.layers(net, origin, shape)])
     rest = {field.name: jnp.zeros(0) for field in dataclasses.fields(RoadMap)}
-    rest |= {"layers": jnp.asarray(layers), "origin": jnp.asarray([[0.0, 0.0], origin])}
+    rest |= {"layers": jnp.asarray(layers), "origin": jnp.asarray([origin, origin], jnp.float32)}
     return RoadMap(**rest)
 
 
