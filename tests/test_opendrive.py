@@ -581,7 +581,7 @@ def test_speed_signs(read, attributes, expected):
     ("vendor", "lane_id"), [("VectorZero", -1), ("someone", 1)], ids=["RoadRunner", "standard"]
 )
 def test_carlas_speed_objects_become_signs(read, vendor, lane_id):
-    names = ["Speed_30", "speed_90", "SpeedLimit40Assembly", "Tree"]
+    names = ["Speed_30", "speed_90", "Speed_50_b", "Speed_x", "SpeedLimit40Assembly"]
     objects = "".join(
         f'<object id="{n}" name="{n}" s="5" t="-4" orientation="-" type="-1"/>' for n in names
     )
@@ -589,6 +589,7 @@ def test_carlas_speed_objects_become_signs(read, vendor, lane_id):
     assert {s.id: s.value for s in network.signals} == {
         "Speed_30": pytest.approx(30 / 3.6),
         "speed_90": pytest.approx(25.0),
+        "Speed_50_b": pytest.approx(50 / 3.6),
     }
     assert governed(network, "Speed_30") == {("1", lane_id): 5.0 if lane_id < 0 else 15.0}
     assert any("not read (2 times" in w for w in network.warnings)

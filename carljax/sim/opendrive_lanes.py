@@ -17,6 +17,8 @@ from carljax.sim.road_network import Lane, RoadMark
 
 # source: ours. Points at most this far apart, and chords at most this far from the true curve, m.
 STEP, CHORD_ERROR = 1.0, 0.008
+# A section with more points than this is not sampled any finer (a road bent into a knot).
+POINTS_MAX = 200_000
 # Jumps in the file can't be refined away: stop here, m.
 STEP_MIN = 0.05
 # A lane further from its road's line, or wider, than this is a typing error, m.
@@ -212,7 +214,7 @@ def sample_positions(road: RoadSpec, section: SectionSpec) -> Positions:
         bad = np.diff(at.s) > 2 * STEP_MIN
         bad &= np.searchsorted(jumps, at.s[1:]) == np.searchsorted(jumps, at.s[:-1])
         bad &= _too_coarse(evaluate(road, section, at), evaluate(road, section, middle))
-        if not bad.any():
+        if not bad.any() or len(at.s) > POINTS_MAX:
             break
         at = at.insert(np.flatnonzero(bad) + 1, middle.s[bad])
     return at

@@ -24,8 +24,8 @@ LIGHT_TYPES = frozenset({"1000001", "1000008", "1000009", "1000010", "1000011", 
 # source: CARLA 0.9.16; the numbers are those of the German road traffic regulations (StVO).
 SIGN_KINDS = {"206": "stop", "205": "yield", "274": "speed"}
 STOP_LINE_TYPES = frozenset({"294"})
-# source: CARLA 0.9.16 reads objects of these names as speed limits in km/h.
-_SPEED_OBJECT = re.compile(r"[Ss]peed_(\d+(?:\.\d+)?)")
+# source: CARLA 0.9.16 reads objects whose names begin so as speed limits, and uses them as km/h.
+_SPEED_OBJECT = re.compile(r"[Ss]peed_\s*(\d+(?:\.\d+)?)")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -47,8 +47,7 @@ class Spot:
 
 def is_speed_object(element: ET.Element) -> bool:
     """Whether an <object> is one of CARLA's speed signs."""
-    named = _SPEED_OBJECT.fullmatch(element.get("name", ""))
-    return named is not None and element.get("type", "-1") == "-1"
+    return _SPEED_OBJECT.match(element.get("name", "")) is not None
 
 
 def section_at(road: RoadSpec, s: float) -> SectionSpec:
@@ -148,7 +147,7 @@ class SignalReader:
             self.warnings.add("signal valid for lane 0 alone, so for no lane: left out", place)
             return None
         name = element.get("name", "")
-        named = _SPEED_OBJECT.fullmatch(name) if element.tag == "object" else None
+        named = _SPEED_OBJECT.match(name) if element.tag == "object" else None
         code = "274" if named else element.get("type", "").strip()
         is_light = code in LIGHT_TYPES and element.get("dynamic", "yes") != "no"
         kind = "light" if is_light else SIGN_KINDS.get(code.partition(".")[0], "other")
