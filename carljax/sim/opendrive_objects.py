@@ -34,7 +34,7 @@ def _rotation(yaw: float, pitch: float, roll: float) -> np.ndarray:
 def _frame(element: ET.Element, road: RoadSpec, place: Place) -> tuple[np.ndarray, np.ndarray]:
     """Origin (3,) and rotation (3, 3) of an object.
 
-    t counts from the reference line; CARLA adds the lane offset, which puts crosswalks off the road.
+    t counts from the reference line; CARLA adds the lane offset, which puts them off the road.
     """
     s, t = (ox.number(element, a, place) for a in ("s", "t"))
     z, hdg, pitch, roll = (
