@@ -76,7 +76,7 @@ def network() -> RoadNetwork:
 
 
 def road_map() -> RoadMap:
-    """Two towns in one place: an empty one and the crossing. Only what the rasterizer reads is filled in."""
+    """Two towns in one place, one empty, one the crossing; only what the rasterizer reads."""
     net = network()
     origin, shape = atlas.frame(net)
     layers = np.stack([np.zeros(shape, np.uint8), atlas.layers(net, origin, shape)])
