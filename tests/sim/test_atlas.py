@@ -97,7 +97,7 @@ def test_layers_at_places_known_by_heart(town):
 
 def test_area_of_the_roads_in_pixels(town):
     bits = town[3]
-    # Four arms of 100 x 7 m, the cross of two 20 x 7 m strips and a parking lane of 100 x 2 m, 4 px/m^2.
+    # Four arms of 100 x 7 m, a cross of 20 x 7 m strips, a parking lane of 100 x 2 m; 4 px/m^2.
     cross = 2 * 20 * 7 - 7 * 7
     assert np.count_nonzero(bits & LAYER_ROAD) == pytest.approx(
         4 * (4 * 100 * 7 + cross + 100 * 2), rel=0.01
