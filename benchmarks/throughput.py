@@ -114,7 +114,7 @@ def render(
     """Observations of moments some steps into episodes, nothing moving."""
     env = small_env(command, config, towns, RENDER_AGENTS, raster)
     scenarios = jnp.arange(RENDER_ENVS) % env.bank.num_scenarios
-    state = jax.jit(drive.start)(env, scenarios, jax.random.key(0))
+    state = jax.jit(drive.start)(env, scenarios, jax.random.key(0)).state
     observe = jit(jax.vmap(DrivingEnv.observe, in_axes=(None, 0)))
     seconds = timed(observe, lambda _: (env, state.replace(obs=None)), command.repeats)
     return {

@@ -1,4 +1,4 @@
-"""Driving without exploration: the policy's mean action, until each episode ends."""
+"""Driving without exploration: the policy's mean action, until each route ends."""
 
 from __future__ import annotations
 
@@ -7,12 +7,13 @@ from collections.abc import Callable
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 
+from carljax import leaderboard
+from carljax.leaderboard import Drive
 from carljax.ppo import beta, trainer
 from carljax.ppo.networks import ActorCritic
 from carljax.sim.env import DrivingEnv
-from carljax.sim.types import Observation, State
+from carljax.sim.types import Observation
 
 
 def act(network: ActorCritic, params: Any, obs: Observation) -> jax.Array:
@@ -30,7 +31,7 @@ def act(network: ActorCritic, params: Any, obs: Observation) -> jax.Array:
     return beta.to_command(beta.mean(alpha, beta_))
 
 
-def start(env: DrivingEnv, scenarios: jax.Array, key: jax.Array) -> State:
+def start(env: DrivingEnv, scenarios: jax.Array, key: jax.Array) -> Drive:
     """Puts the ego at the start of given scenarios.
 
     Args:
@@ -39,37 +40,38 @@ def start(env: DrivingEnv, scenarios: jax.Array, key: jax.Array) -> State:
       key: PRNG key of what the scenarios leave open; the same key and row give the same start.
 
     Returns:
-      (B,) states.
+      (B,) drives.
     """
 
-    def one(scenario: jax.Array) -> State:
-        return env.observe(env.start_scenario(scenario, jax.random.fold_in(key, scenario)))
+    def one(scenario: jax.Array) -> Drive:
+        state = env.start_scenario(scenario, jax.random.fold_in(key, scenario))
+        return leaderboard.begin(env.observe(state))
 
     return jax.vmap(one)(scenarios)
 
 
 def step(
-    network: ActorCritic, env: DrivingEnv, params: Any, state: State
-) -> tuple[State, jax.Array]:
-    """Makes one step; ended episodes stay as they ended.
+    network: ActorCritic, env: DrivingEnv, params: Any, drive: Drive
+) -> tuple[Drive, jax.Array]:
+    """Makes one step by the rules of `leaderboard`; routes that have ended stay as they ended.
 
     Args:
       network: actor and critic.
       env: the environment.
       params: its variables.
-      state: (B,) states.
+      drive: (B,) drives.
 
     Returns:
-      (B,) states and the (B, 2) actions taken.
+      (B,) drives and the (B, 2) actions taken.
     """
-    command = act(network, params, state.obs)
+    command = act(network, params, drive.state.obs)
 
-    def one(state: State, action: jax.Array) -> State:
-        moved = env.advance(state, action)
-        kept = jax.tree.map(lambda a, b: jnp.where(state.done > 0, a, b), state, moved)
-        return env.observe(kept)
+    def one(drive: Drive, action: jax.Array) -> Drive:
+        moved = leaderboard.advance(env, drive, action)
+        return moved.replace(state=env.observe(moved.state))
 
-    return jax.vmap(one)(state.replace(obs=None), command), command
+    blind = drive.replace(state=drive.state.replace(obs=None))
+    return jax.vmap(one)(blind, command), command
 
 
 @functools.cache

@@ -8,7 +8,6 @@ same score.
 from __future__ import annotations
 
 import dataclasses
-import functools
 import json
 import sys
 from collections.abc import Sequence
@@ -24,24 +23,17 @@ from rich.console import Console
 from carljax import atomic, build, checkpoint, drive, machine, run_dir, scores
 from carljax.checkpoint import CheckpointError
 from carljax.config import HELD_OUT_SEED, ConfigError, TrainConfig
+from carljax.leaderboard import INFRACTIONS, Drive
 from carljax.ppo.networks import ActorCritic
 from carljax.render import gif
-from carljax.reward import collision
 from carljax.scores import EvalResult, RouteScore
 from carljax.sim.env import DrivingEnv
 from carljax.sim.road_network import MapError
 from carljax.sim.route_generator import RouteError
 from carljax.sim.town import Town
-from carljax.sim.types import KIND_PEDESTRIAN, KIND_STATIC, KIND_VEHICLE, State
 
 FILE = "evaluation.json"
 TRAFFIC_SEED = 0
-COLLISIONS = {
-    "pedestrian_collision": KIND_PEDESTRIAN,
-    "vehicle_collision": KIND_VEHICLE,
-    "static_collision": KIND_STATIC,
-}
-CAUSES = ("red_light", "stop_sign", "off_road", "route_deviation", "blocked", "timeout")
 
 
 def held_out(config: TrainConfig, towns: Sequence[Town], num_routes: int) -> DrivingEnv:
@@ -64,10 +56,11 @@ def evaluate(
       The scores.
     """
     drive_all = drive.compiled(_drive_all, network)
-    metrics, collisions = jax.device_get(drive_all(env, jax.device_get(params)))
+    ended: Drive = jax.device_get(drive_all(env, jax.device_get(params)))
+    metrics, counts = ended.state.metrics, ended.counts
     towns = np.asarray(env.bank.routes.town)
     names = town_names or [str(number) for number in range(towns.max() + 1)]
-    lengths = np.max(np.asarray(env.bank.routes.s), axis=1)
+    lengths = np.asarray(env.bank.routes.length)
     return EvalResult(
         tuple(
             RouteScore(
@@ -77,12 +70,12 @@ def evaluate(
                 driven_km=float(metrics["episode/km"][i]),
                 seconds=float(metrics["episode/length"][i]) * env.config.dt,
                 completion=float(metrics["episode/route_completion"][i]),
+                clean_completion=float(ended.clean_completion[i]),
                 outside_frac=_fraction(
                     metrics["episode/outside_lanes_km"][i], metrics["episode/km"][i]
                 ),
-                infractions=(
-                    *(name for name in COLLISIONS if collisions[name][i]),
-                    *(name for name in CAUSES if metrics[f"reward/{name}"][i] > 0),
+                infractions=tuple(
+                    name for name in INFRACTIONS for _ in range(int(counts[name][i]))
                 ),
             )
             for i in range(len(lengths))
@@ -90,28 +83,19 @@ def evaluate(
     )
 
 
-def _drive_all(
-    network: ActorCritic, env: DrivingEnv, params: Any
-) -> tuple[dict[str, jax.Array], dict[str, jax.Array]]:
-    """Drives until all episodes have ended; metrics of their last steps, collisions by kind."""
+def _drive_all(network: ActorCritic, env: DrivingEnv, params: Any) -> Drive:
+    """Drives until all routes have ended; (B,) drives as they ended, without key and images."""
 
-    def is_any_running(state: State) -> jax.Array:
-        return jnp.any(state.done == 0)
+    def is_any_running(run: Drive) -> jax.Array:
+        return jnp.any(run.state.done == 0)
 
-    def again(state: State) -> State:
-        return drive.step(network, env, params, state)[0]
+    def again(run: Drive) -> Drive:
+        return drive.step(network, env, params, run)[0]
 
     scenarios = jnp.arange(env.bank.num_scenarios)
-    state = drive.start(env, scenarios, jax.random.key(TRAFFIC_SEED))
-    state = jax.lax.while_loop(is_any_running, again, state)
-    return state.metrics, jax.vmap(functools.partial(collided_kinds, env))(state)
-
-
-def collided_kinds(env: DrivingEnv, state: State) -> dict[str, jax.Array]:
-    """Which kinds of road user the ego touches, {name: () bool}; unbatched."""
-    sim = state.pipeline_state
-    touched = collision.touched(sim.ego, sim.agents, env.vehicle, env.reward_config.z_gap)
-    return {name: jnp.any(touched & (sim.agents.kind == kind)) for name, kind in COLLISIONS.items()}
+    run = drive.start(env, scenarios, jax.random.key(TRAFFIC_SEED))
+    run = jax.lax.while_loop(is_any_running, again, run)
+    return run.replace(state=run.state.replace(pipeline_state=None, obs=None))
 
 
 def _fraction(part: float, whole: float) -> float:
@@ -212,8 +196,8 @@ def _load_params(
     network = ActorCritic(config.network)
 
     def initialise(env: DrivingEnv) -> Any:
-        state = drive.start(env, jnp.arange(1), jax.random.key(TRAFFIC_SEED))
-        return network.init(jax.random.key(config.run.seed), state.obs)
+        first = drive.start(env, jnp.arange(1), jax.random.key(TRAFFIC_SEED))
+        return network.init(jax.random.key(config.run.seed), first.state.obs)
 
     if command.untrained:
         return jax.jit(initialise)(env), None

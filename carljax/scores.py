@@ -1,9 +1,7 @@
 """The Driving Score: route completion times a factor for each infraction.
 
-Source: CARLA leaderboard 2.0. One difference: here an episode ends at its first collision, red
-light, stop sign or other failure, where the leaderboard counts it and lets the car go on to the end
-of the route. So completion is lower here and no route has two of these infractions of different
-steps.
+Source: CARLA leaderboard 2.0; `leaderboard` says how a drive goes on after one. The completion up
+to the first infraction is reported beside it: what an episode of training would have reached.
 """
 
 from __future__ import annotations
@@ -16,6 +14,8 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from carljax.leaderboard import ENDS, INFRACTIONS
+
 # source: CARLA leaderboard 2.0, infraction penalties
 FACTORS: Mapping[str, float] = {
     "pedestrian_collision": 0.5,
@@ -24,9 +24,7 @@ FACTORS: Mapping[str, float] = {
     "red_light": 0.7,
     "stop_sign": 0.8,
 }
-# Ends without a factor of their own: what they cost is the rest of the route.
-ENDS = ("off_road", "route_deviation", "blocked", "timeout")
-INFRACTIONS = (*FACTORS, *ENDS)
+# `leaderboard.ENDS` have no factor of their own: what they cost is the rest of the route.
 
 
 @dataclasses.dataclass(frozen=True)
@@ -40,8 +38,9 @@ class RouteScore:
       driven_km: by the ego.
       seconds: of simulated time.
       completion: percent of the route.
+      clean_completion: percent of the route at the first infraction of any kind.
       outside_frac: fraction of the driven distance outside lanes.
-      infractions: names of `INFRACTIONS` that happened; empty where the route was finished.
+      infractions: names of `INFRACTIONS`, one for each time it happened.
     """
 
     route: int
@@ -50,6 +49,7 @@ class RouteScore:
     driven_km: float
     seconds: float
     completion: float
+    clean_completion: float
     outside_frac: float
     infractions: tuple[str, ...]
 
@@ -79,6 +79,11 @@ class EvalResult:
         return _mean_and_std([route.completion for route in self.routes])
 
     @property
+    def clean_completion(self) -> tuple[float, float]:
+        """Mean and standard deviation of the completion up to the first infraction, percent."""
+        return _mean_and_std([route.clean_completion for route in self.routes])
+
+    @property
     def completed_km(self) -> float:
         """Length of the routes as far as they were completed, summed up, km."""
         return sum(route.length_km * route.completion / 100.0 for route in self.routes)
@@ -91,14 +96,15 @@ class EvalResult:
         """
         km = max(self.completed_km, 0.001 * len(self.routes))
         return {
-            name: sum(name in route.infractions for route in self.routes) / km
+            name: sum(route.infractions.count(name) for route in self.routes) / km
             for name in INFRACTIONS
         }
 
     @property
     def finished_frac(self) -> float:
         """Fraction of routes driven to their end."""
-        return sum(not route.infractions for route in self.routes) / len(self.routes)
+        finished = [not set(route.infractions) & set(ENDS) for route in self.routes]
+        return sum(finished) / len(self.routes)
 
     def by_town(self) -> dict[str, EvalResult]:
         """The same scores for each town apart."""
@@ -116,6 +122,8 @@ class EvalResult:
             "driving_score_std": score[1],
             "route_completion_mean": completion[0],
             "route_completion_std": completion[1],
+            "clean_completion_mean": self.clean_completion[0],
+            "clean_completion_std": self.clean_completion[1],
             "finished_frac": self.finished_frac,
             "num_routes": len(self.routes),
             "completed_km": self.completed_km,
@@ -130,15 +138,17 @@ class EvalResult:
 def show(result: EvalResult, console: Console) -> None:
     """Prints the scores as two tables: by town, and infractions by kind."""
     towns = Table(title=f"{len(result.routes)} held-out routes, deterministic policy")
-    for name in ("town", "routes", "Driving Score", "route completion %", "finished %"):
+    columns = ("Driving Score", "route completion %", "before 1st infraction %", "finished %")
+    for name in ("town", "routes", *columns):
         towns.add_column(name, justify="left" if name == "town" else "right")
     for town, part in {"all": result, **result.by_town()}.items():
-        score, completion = part.driving_score, part.completion
+        score, completion, clean = part.driving_score, part.completion, part.clean_completion
         towns.add_row(
             town,
             str(len(part.routes)),
             f"{score[0]:.1f} ± {score[1]:.1f}",
             f"{completion[0]:.1f} ± {completion[1]:.1f}",
+            f"{clean[0]:.1f} ± {clean[1]:.1f}",
             f"{100 * part.finished_frac:.0f}",
         )
     rates = Table(title=f"infractions on {result.completed_km:.1f} km")

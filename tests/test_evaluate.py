@@ -10,14 +10,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import shapely
 from helpers import once
 from PIL import Image
 
-from carljax import build, checkpoint, evaluate, presets, run_dir
+from carljax import build, checkpoint, evaluate, leaderboard, presets, run_dir
 from carljax.config import RunConfig
 from carljax.ppo.config import NetworkConfig
 from carljax.ppo.networks import ActorCritic
 from carljax.ppo.types import TrainState
+from carljax.reward import reward
 from carljax.reward.config import RewardConfig
 from carljax.sim import towns
 from carljax.sim.env import EnvConfig
@@ -72,7 +74,7 @@ def result(env, params):
 
 @pytest.fixture(scope="module")
 def one_by_one(env, params):
-    """The same routes in a Python loop: last states, metres driven and metres outside lanes."""
+    """The same routes in a Python loop that knows the rules of the leaderboard by itself."""
     network = ActorCritic(CONFIG.network)
 
     @jax.jit
@@ -85,29 +87,61 @@ def one_by_one(env, params):
         alpha, beta, _ = network.apply(params, jax.tree.map(lambda x: x[None], state.obs))
         return env.step(state, 2 * (alpha / (alpha + beta))[0] - 1)
 
-    ends = []
-    for scenario in range(NUM_ROUTES):
-        state, metres, outside = first(jnp.int32(scenario)), 0.0, 0.0
-        while not state.done:
-            state = step(state)
-            moved = float(state.pipeline_state.ego.speed) * 0.1
-            metres += moved
-            outside += moved if state.metrics["reward/outside_lanes"] == 0 else 0.0
-        ends.append((state, metres, outside))
-    return ends
+    return [drive_by_the_rules(first(jnp.int32(i)), step, env.vehicle) for i in range(NUM_ROUTES)]
+
+
+def drive_by_the_rules(state, step, vehicle):
+    """Returns the last state, metres driven and outside lanes, infractions, clean completion."""
+    metres, outside, happened, clean = 0.0, 0.0, [], None
+    while True:
+        was_moving = float(state.pipeline_state.ego.speed) >= 0.1
+        state = step(state)
+        sim, metrics = state.pipeline_state, state.metrics
+        moved = float(sim.ego.speed) * 0.1
+        metres += moved
+        outside += moved if metrics["reward/outside_lanes"] == 0 else 0.0
+        completion = float(metrics["episode/route_completion"])
+        causes = [name for name in reward.CAUSES if metrics[f"reward/{name}"] > 0]
+        new = [name for name in causes if name != "collision"]
+        if "collision" in causes:
+            struck = boxes_that_meet(sim, vehicle)
+            assert struck.any()
+            new += ["vehicle_collision"] * was_moving
+            kind = jnp.where(struck, 0, sim.agents.kind)
+            still = sim.ego.replace(speed=jnp.float32(0), yaw_rate=jnp.float32(0))
+            sim = sim.replace(agents=sim.agents.replace(kind=kind), ego=still)
+        if new and clean is None:
+            clean = completion
+        happened += new
+        if {"off_road", "route_deviation", "blocked"} & set(new) or metrics["reward/finished"]:
+            return state, metres, outside, happened, completion if clean is None else clean
+        state = state.replace(pipeline_state=sim, done=jnp.float32(0))
+
+
+def boxes_that_meet(sim, vehicle):
+    """(N,) bool, by polygons in float64."""
+
+    def box(xy, yaw, length, width):
+        corners = np.array([[1, 1], [1, -1], [-1, -1], [-1, 1]]) * [length / 2, width / 2]
+        c, s = np.cos(yaw), np.sin(yaw)
+        return shapely.Polygon(np.asarray(xy) + corners @ np.array([[c, s], [-s, c]]))
+
+    ego = box(sim.ego.xy, sim.ego.yaw, vehicle.length, vehicle.width)
+    others = sim.agents
+    rows = zip(others.xy, others.yaw, others.length, others.width, others.kind, strict=True)
+    return np.array([kind > 0 and box(*pose).intersects(ego) for *pose, kind in rows])
 
 
 def test_driving_all_at_once_is_driving_one_by_one(result, one_by_one):
-    for route, (state, metres, outside) in zip(result.routes, one_by_one, strict=True):
+    for route, drive in zip(result.routes, one_by_one, strict=True):
+        state, metres, outside, happened, clean = drive
         assert route.seconds == pytest.approx(0.1 * int(state.pipeline_state.step_count))
         assert route.driven_km == pytest.approx(metres / 1000, rel=1e-3)
         assert route.outside_frac == pytest.approx(outside / metres, abs=2e-3)
         progress = float(state.pipeline_state.reward_state.route_s) / (1000 * route.length_km)
         assert route.completion == pytest.approx(100 * progress, abs=0.5)
-        causes = {name for name in evaluate.CAUSES if state.metrics[f"reward/{name}"] > 0}
-        assert set(route.infractions) - set(evaluate.COLLISIONS) == causes
-        has_collided = bool(state.metrics["reward/collision"] > 0)
-        assert bool(set(route.infractions) & set(evaluate.COLLISIONS)) == has_collided
+        assert route.clean_completion == pytest.approx(clean, abs=1e-3)
+        assert sorted(route.infractions) == sorted(happened)
 
 
 def test_the_policy_here_drives(result):
@@ -138,8 +172,23 @@ def test_a_collision_names_what_was_touched(env):
         kind=sim.agents.kind.at[0].set(KIND_VEHICLE),
     )
     touching = state.replace(pipeline_state=sim.replace(agents=agents))
-    kinds = evaluate.collided_kinds(env, touching)
-    assert {name for name, hit in kinds.items() if hit} == {"vehicle_collision"}
+    struck = leaderboard.struck_agents(env, touching)
+    moving = state.replace(pipeline_state=sim.replace(ego=sim.ego.replace(speed=jnp.float32(5))))
+    happened = leaderboard.infractions(moving, touching, struck)
+    assert {name for name, hit in happened.items() if hit} == {"vehicle_collision"}
+    # A car at rest that is struck is not to blame.
+    assert not any(leaderboard.infractions(state, touching, struck).values())
+
+
+def test_a_collision_halts_the_ego_and_takes_the_struck_car_away(env):
+    state = jax.jit(lambda: env.reset(jax.random.key(1)))()
+    sim = state.pipeline_state
+    moving = sim.replace(ego=sim.ego.replace(speed=jnp.float32(5)))
+    struck = jnp.arange(sim.agents.kind.shape[0]) == 0
+    after = leaderboard.go_on(state.replace(pipeline_state=moving, done=jnp.float32(1)), struck)
+    assert float(after.done) == 0 and float(after.pipeline_state.ego.speed) == 0
+    assert not after.pipeline_state.agents.valid[0]
+    np.testing.assert_array_equal(after.pipeline_state.agents.kind[1:], sim.agents.kind[1:])
 
 
 @pytest.fixture(scope="module")

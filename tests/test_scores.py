@@ -19,6 +19,7 @@ FINISHED = RouteScore(
     driven_km=1.02,
     seconds=120.0,
     completion=100.0,
+    clean_completion=100.0,
     outside_frac=0.0,
     infractions=(),
 )
@@ -29,8 +30,9 @@ CRASHED = RouteScore(
     driven_km=1.0,
     seconds=60.0,
     completion=50.0,
+    clean_completion=30.0,
     outside_frac=0.1,
-    infractions=("vehicle_collision",),
+    infractions=("vehicle_collision", "off_road"),
 )
 
 
@@ -50,6 +52,7 @@ def test_completion_is_multiplied_by_every_factor():
         (("red_light",), 0.7),
         (("stop_sign",), 0.8),
         (("vehicle_collision", "red_light"), 0.42),  # 0.6 x 0.7
+        (("red_light", "red_light", "stop_sign"), 0.392),  # 0.7 x 0.7 x 0.8: each time counts
         (("off_road",), 1.0),
         (("blocked",), 1.0),
     ],
@@ -64,11 +67,19 @@ def test_a_set_of_routes_has_mean_deviation_and_rates():
     # Scores 100 and 27: mean 63.5, deviation 36.5. Completion 100 and 50: mean 75, deviation 25.
     assert result.driving_score == pytest.approx((63.5, 36.5))
     assert result.completion == pytest.approx((75.0, 25.0))
+    assert result.clean_completion == pytest.approx((65.0, 35.0))  # 100 and 30
     assert result.finished_frac == 0.5
     # 1 km x 100 % + 2 km x 50 % = 2 km with one collision
     assert result.completed_km == pytest.approx(2.0)
     assert result.infractions_per_km["vehicle_collision"] == pytest.approx(0.5)
     assert result.infractions_per_km["red_light"] == 0.0
+
+
+def test_a_route_that_was_driven_to_its_end_is_finished_whatever_it_cost():
+    costly = dataclasses.replace(FINISHED, infractions=("red_light", "red_light"))
+    result = EvalResult((costly,))
+    assert result.finished_frac == 1.0
+    assert result.infractions_per_km["red_light"] == pytest.approx(2.0)
 
 
 def test_a_route_without_any_progress_counts_a_metre():
@@ -84,7 +95,7 @@ def test_towns_are_scored_apart():
 def test_json_holds_summary_and_routes():
     values = json.loads(json.dumps(EvalResult((FINISHED, CRASHED)).to_json()))
     assert values["driving_score_mean"] == pytest.approx(63.5)
-    assert values["routes"][1]["infractions"] == ["vehicle_collision"]
+    assert values["routes"][1]["infractions"] == ["vehicle_collision", "off_road"]
     assert values["routes"][1]["driving_score"] == pytest.approx(27.0)
 
 

@@ -1,0 +1,1 @@
+"""Pictures for people: never imported by the simulator or the learner."""

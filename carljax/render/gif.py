@@ -66,9 +66,10 @@ def episode(
     """
     step = drive.compiled(drive.step, network)
     params = jax.device_get(params)
-    state = jax.jit(drive.start)(env, jnp.array([scenario]), jax.random.key(seed))
+    run = jax.jit(drive.start)(env, jnp.array([scenario]), jax.random.key(seed))
     for number in range(1, MAX_FRAMES * FRAME_EVERY + 1):
-        state, command = step(env, params, state)
+        run, command = step(env, params, run)
+        state = run.state
         is_last = float(state.done[0]) > 0
         if is_last or number % FRAME_EVERY == 0:
             one = jax.tree.map(lambda x: x[0], state.replace(pipeline_state=_keyless(state)))
