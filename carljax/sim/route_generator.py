@@ -19,6 +19,7 @@ LANE_CHANGE_PROB = 0.10  # per metre. source: authors' generator
 LANE_CHANGE_GAP = 200.0  # m. source: authors' generator
 LANE_CHANGE_MIN_WIDTH = 2.5  # m; no change onto a lane that is about to end or has just begun
 START_SPEED_LIMIT = 30.0 / 3.6  # m/s, until the first sign. source: paper, Soft Penalties
+SAME_SIGN = 3.0  # m of route within which a sign is passed once. source: ours
 ATTEMPTS = 200
 
 
@@ -172,11 +173,12 @@ def _assemble(
     lane, lane_s = _sample(segments, sizes.num_points)
     num = len(lane)
     pose = _poses(town, lane, lane_s)
-    stops = _stops_on(town, lane, lane_s)
-    signs = _signs_on(town, lane, lane_s)
-    if len(stops) > sizes.num_stops or len(signs) > sizes.num_signs:
+    stops_at, stop_lane = _stops_on(town, segments, num)
+    signs = _signs_on(town, segments, num)
+    if len(stops_at) > sizes.num_stops or len(signs) > sizes.num_signs:
         return None
     table = town.lanes
+    line = _poses(town, stop_lane, table.stop_s[stop_lane])
     step = np.hypot(*np.diff(pose[:, :2], axis=0).T)
     light = town.lights.lane_light
     light = np.where(light >= 0, light + first.light, -1)
@@ -187,7 +189,6 @@ def _assemble(
         last = values[-1:] if fill is None else np.full((1, *values.shape[1:]), fill)
         return np.concatenate([values, np.repeat(last, size - len(values), axis=0)])
 
-    stop_lane = lane[stops]
     return Route(
         xy=pad(pose[:, :2], sizes.num_points).astype(np.float32),
         yaw=pad(pose[:, 2], sizes.num_points).astype(np.float32),
@@ -200,13 +201,13 @@ def _assemble(
         length=np.float32(s[-1]),
         z=np.float32(table.point_xyz[table.start[lane[0]] + int(lane_s[0]), 2]),
         town=np.int32(first.town),
-        stop_idx=pad(stops, sizes.num_stops, -1).astype(np.int32),
-        stop_xy=pad(pose[stops, :2], sizes.num_stops, 0.0).astype(np.float32),
-        stop_yaw=pad(pose[stops, 2], sizes.num_stops, 0.0).astype(np.float32),
-        stop_s=pad(s[stops], sizes.num_stops, 0.0).astype(np.float32),
+        stop_idx=pad(_first_after(stops_at), sizes.num_stops, -1).astype(np.int32),
+        stop_xy=pad(line[:, :2], sizes.num_stops, 0.0).astype(np.float32),
+        stop_yaw=pad(line[:, 2], sizes.num_stops, 0.0).astype(np.float32),
+        stop_s=pad(np.interp(stops_at, np.arange(num), s), sizes.num_stops, 0.0).astype(np.float32),
         stop_kind=pad(table.stop_kind[stop_lane], sizes.num_stops, STOP_NONE).astype(np.int32),
         stop_light=pad(light[stop_lane], sizes.num_stops, -1).astype(np.int32),
-        stop_width=pad(pose[stops, 3], sizes.num_stops, 0.0).astype(np.float32),
+        stop_width=pad(line[:, 3], sizes.num_stops, 0.0).astype(np.float32),
         sign_xy=pad(
             np.array([town.network.signals[i].xyz[:2] for _, i in signs]).reshape(-1, 2),
             sizes.num_signs,
@@ -243,29 +244,48 @@ def _poses(town: Town, lane: np.ndarray, lane_s: np.ndarray) -> np.ndarray:
     return np.column_stack([xy, yaw, table.point_width[row]])
 
 
-def _stops_on(town: Town, lane: np.ndarray, lane_s: np.ndarray) -> np.ndarray:
-    """Route indices just at or after each stop line passed."""
+def _passings(segments: list[_Segment], lane: int, s: float, num: int) -> list[float]:
+    """Distances along the route, m, at which it passes a place of the table."""
+    out, begun = [], 0.0
+    for seg in segments:
+        if seg.lane == lane and seg.start - 1e-6 <= s <= seg.end:
+            out.append(begun + max(0.0, s - seg.start))
+        begun += seg.end - seg.start
+    return [at for at in out if _first_after(np.array(at)) < num]
+
+
+def _first_after(distance: np.ndarray) -> np.ndarray:
+    """Index of the first route point at or beyond a distance along the route, m."""
+    return np.ceil(distance - 1e-6).astype(int)
+
+
+def _stops_on(town: Town, segments: list[_Segment], num: int) -> tuple[np.ndarray, np.ndarray]:
+    """Stop lines passed, in order: distance along the route, m, and row in the lane table.
+
+    A lane entered beyond its line (start of the route, lane change) has no line on this route.
+    """
     table = town.lanes
-    beyond = (table.stop_kind[lane] != STOP_NONE) & (lane_s >= table.stop_s[lane] - 1e-6)
-    entered = np.concatenate([[True], lane[1:] != lane[:-1]])
-    before = np.concatenate([[False], beyond[:-1]])
-    first = beyond & (entered | ~before)
-    # A lane entered beyond its line (start of the route, lane change) has no line on this route.
-    return np.flatnonzero(first & (lane_s - table.stop_s[lane] < 1.0 + 1e-6))
+    passed = {
+        (at, lane)
+        for lane in {seg.lane for seg in segments}
+        if table.stop_kind[lane] != STOP_NONE
+        for at in _passings(segments, lane, float(table.stop_s[lane]), num)
+    }
+    ordered = sorted(passed)
+    return np.array([at for at, _ in ordered]), np.array([lane for _, lane in ordered], int)
 
 
-def _signs_on(town: Town, lane: np.ndarray, lane_s: np.ndarray) -> list[tuple[int, int]]:
+def _signs_on(town: Town, segments: list[_Segment], num: int) -> list[tuple[int, int]]:
     """(route index, index into `network.signals`) of each speed sign passed, in order."""
     on: list[tuple[int, int]] = []
     for number, signal in enumerate(town.network.signals):
         if signal.kind != "speed" or signal.value is None:
             continue
-        passed: set[int] = set()
-        for governed in signal.governed:
-            place = town.lanes.place(governed.lane, governed.distance)
-            hits = np.flatnonzero((lane == place.lane) & (np.abs(lane_s - place.s) <= 0.5))
-            passed.update(int(hit) for hit in hits if not {hit - 1, hit - 2} & passed)
-        on.extend((at, number) for at in passed)
+        places = [town.lanes.place(g.lane, g.distance) for g in signal.governed]
+        passed = sorted(at for p in places for at in _passings(segments, p.lane, p.s, num))
+        # One sign for several lanes is passed once, even by a route that changes lane beside it.
+        first = [at for i, at in enumerate(passed) if i == 0 or at - passed[i - 1] > SAME_SIGN]
+        on.extend((int(_first_after(np.array(at))), number) for at in first)
     return sorted(on)
 
 

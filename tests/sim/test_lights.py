@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from small_world import ARMS, approach, crossing, inner, link, network, signal, straight
 
-from carljax.sim import lane_table, light_table, lights, town, towns
+from carljax.sim import lane_table, light_table, lights, towns
 from carljax.sim.road_network import Controller
 from carljax.sim.types import LIGHT_GREEN, LIGHT_RED, LIGHT_YELLOW
 
@@ -107,8 +107,8 @@ def test_a_town_without_lights_still_has_a_table():
 
 
 @pytest.mark.parametrize("name", towns.names())
-def test_one_group_at_a_time_goes_in_bundled_towns(name):
-    found = town.load(towns.path(name))
+def test_one_group_at_a_time_goes_in_bundled_towns(name, bundled):
+    found = bundled[name]
     lit = np.flatnonzero(found.lights.lane_light >= 0)
     junction_of = {}
     for lane in lit:
