@@ -29,8 +29,7 @@ INFRACTIONS = (*COLLISIONS, *GOES_ON, *ENDS)
 BLAME_SPEED = 0.1
 
 
-@struct.dataclass
-class Drive:
+class Drive(struct.PyTreeNode):
     """One drive so far.
 
     Attributes:

@@ -10,8 +10,7 @@ from flax import struct
 from carljax.sim.types import Observation, State
 
 
-@struct.dataclass
-class Transition:
+class Transition(struct.PyTreeNode):
     """Steps of a rollout, (T, B) in front.
 
     Attributes:
@@ -35,8 +34,7 @@ class Transition:
     weight: jax.Array
 
 
-@struct.dataclass
-class Minibatch:
+class Minibatch(struct.PyTreeNode):
     """Samples of one gradient step, or a piece of them; (N,) in front.
 
     Attributes:
@@ -58,8 +56,7 @@ class Minibatch:
     weight: jax.Array
 
 
-@struct.dataclass
-class TrainState:
+class TrainState(struct.PyTreeNode):
     """All that an exact resume needs.
 
     Attributes:

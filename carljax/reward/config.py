@@ -13,8 +13,7 @@ from typing import Literal
 from flax import struct
 
 
-@struct.dataclass
-class RewardConfig:
+class RewardConfig(struct.PyTreeNode):
     """The CaRL reward: progress times soft factors minus a terminal penalty."""
 
     ttc_forecast: Literal["arc", "straight"] = struct.field(pytree_node=False, default="arc")

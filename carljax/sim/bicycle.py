@@ -24,8 +24,7 @@ from carljax.sim.types import EgoState
 GEAR_SPEEDS = (0.1, 4.0, 8.0, 13.0, 19.0, 26.0)
 
 
-@struct.dataclass
-class VehicleParams:
+class VehicleParams(struct.PyTreeNode):
     """A car: its box, its steering and how it gains and loses speed.
 
     The acceleration law is ours: accel_max * throttle ** throttle_exponent * exp(-speed /
@@ -143,7 +142,7 @@ def step(
     chord = distance * jnp.sinc(half_turn / np.float32(np.pi))
     direction = ego.yaw + slip + half_turn
     offset = jnp.stack([chord * jnp.cos(direction), chord * jnp.sin(direction)])
-    return ego.replace(  # type: ignore[attr-defined]
+    return ego.replace(
         xy=ego.xy + offset,
         yaw=wrap_angle(ego.yaw + 2.0 * half_turn),
         speed=speed,

@@ -42,8 +42,7 @@ class EnvConfig:
     """The bird's-eye view image."""
 
 
-@struct.dataclass
-class DrivingEnv:
+class DrivingEnv(struct.PyTreeNode):
     """Everything an episode needs and doesn't change; an argument of jitted functions.
 
     Attributes:

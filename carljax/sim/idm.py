@@ -14,8 +14,7 @@ GAP_FLOOR = 0.1  # m; nearer than this a driver brakes as hard as it can anyway
 SPEED_FLOOR = 0.1  # m/s; keeps speed / desired_speed finite
 
 
-@struct.dataclass
-class IDMParams:
+class IDMParams(struct.PyTreeNode):
     """A driver.
 
     Source of the values: Treiber and Kesting, Traffic Flow Dynamics (2013), table 11.2.

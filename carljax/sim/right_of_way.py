@@ -19,8 +19,7 @@ PATIENCE = (
 )
 
 
-@struct.dataclass
-class Mover:
+class Mover(struct.PyTreeNode):
     """What others see of a car: agents and, as the last row, the ego; all (N + 1,).
 
     Attributes:
@@ -41,8 +40,7 @@ class Mover:
     can_go: jax.Array
 
 
-@struct.dataclass
-class EgoPlace:
+class EgoPlace(struct.PyTreeNode):
     """Where the ego is on the lane graph: lane, next_lane () int32 (-1 unknown), s () m."""
 
     lane: jax.Array
@@ -50,8 +48,7 @@ class EgoPlace:
     s: jax.Array
 
 
-@struct.dataclass
-class StopAhead:
+class StopAhead(struct.PyTreeNode):
     """The next stop line of each agent, (N,).
 
     Attributes:

@@ -19,8 +19,7 @@ LAYER_ROAD, LAYER_SHOULDER, LAYER_MARK_SOLID, LAYER_MARK_BROKEN, LAYER_JUNCTION,
 )
 
 
-@struct.dataclass
-class RoadMap:
+class RoadMap(struct.PyTreeNode):
     """Lanes, lights and pixel atlases of M towns.
 
     All towns share one table of driving lanes; a lane's index says which town it belongs to.
@@ -89,8 +88,7 @@ class RoadMap:
 PIXELS_PER_METRE = 2.0
 
 
-@struct.dataclass
-class LaneQuery:
+class LaneQuery(struct.PyTreeNode):
     """The nearest driving lane to a place.
 
     Attributes:
@@ -165,8 +163,7 @@ def nearest_lane(road_map: RoadMap, town: jax.Array, xy: jax.Array) -> LaneQuery
     )
 
 
-@struct.dataclass
-class Pose:
+class Pose(struct.PyTreeNode):
     """A place on a lane in the world: xy (..., 2) m, z m, yaw rad, curvature 1/m."""
 
     xy: jax.Array

@@ -14,8 +14,7 @@ WINDOW = WINDOW_BACK + WINDOW_AHEAD
 LOOK_AHEAD = 6  # the current point and the next five. source: carl-facts 4.3, route deviation
 
 
-@struct.dataclass
-class Route:
+class Route(struct.PyTreeNode):
     """One route (the bank holds S of them with a leading axis).
 
     Attributes:

@@ -26,8 +26,7 @@ EGO_CLEARANCE = 18.0  # m kept free around the start
 ROUTE_SLACK = 8  # route points beyond one per metre
 
 
-@struct.dataclass
-class ScenarioBank:
+class ScenarioBank(struct.PyTreeNode):
     """All that stays the same while training: held once per device.
 
     Attributes:

@@ -23,8 +23,7 @@ LIGHT_GREEN, LIGHT_YELLOW, LIGHT_RED = 0, 1, 2
 STOP_BOX_LENGTH = 3.0
 
 
-@struct.dataclass
-class EgoState:
+class EgoState(struct.PyTreeNode):
     """The ego vehicle; its reference point is the centre of its box.
 
     Attributes:
@@ -52,8 +51,7 @@ class EgoState:
     brake: jax.Array
 
 
-@struct.dataclass
-class Agents:
+class Agents(struct.PyTreeNode):
     """The other road users.
 
     Attributes:
@@ -93,8 +91,7 @@ class Agents:
         return self.kind != KIND_NONE
 
 
-@struct.dataclass
-class Situation:
+class Situation(struct.PyTreeNode):
     """Where the ego is on road and route after a step, looked up once for all who ask.
 
     Attributes:
@@ -140,8 +137,7 @@ class Situation:
     stop_light: jax.Array
 
 
-@struct.dataclass
-class History:
+class History(struct.PyTreeNode):
     """Ego motion of the last D = 15 steps, oldest first, for the comfort filter.
 
     Attributes:
@@ -156,8 +152,7 @@ class History:
     num: jax.Array
 
 
-@struct.dataclass
-class RewardState:
+class RewardState(struct.PyTreeNode):
     """What the reward remembers within an episode.
 
     Attributes:
@@ -181,8 +176,7 @@ class RewardState:
     line_crossed: jax.Array
 
 
-@struct.dataclass
-class RewardTerms:
+class RewardTerms(struct.PyTreeNode):
     """One step's reward, taken apart.
 
     Attributes:
@@ -202,8 +196,7 @@ class RewardTerms:
     penalty: jax.Array
 
 
-@struct.dataclass
-class SimState:
+class SimState(struct.PyTreeNode):
     """The whole state of one environment: a few kB, no map and no image.
 
     Attributes:
@@ -226,8 +219,7 @@ class SimState:
     key: jax.Array
 
 
-@struct.dataclass
-class Observation:
+class Observation(struct.PyTreeNode):
     """What the policy sees.
 
     Attributes:
@@ -241,8 +233,7 @@ class Observation:
     value_scalars: jax.Array
 
 
-@struct.dataclass
-class State:
+class State(struct.PyTreeNode):
     """What `reset` and `step` return (Brax's names).
 
     Attributes:
