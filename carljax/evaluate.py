@@ -98,7 +98,7 @@ def _drive_all(network: ActorCritic, env: DrivingEnv, params: Any) -> Drive:
     return run.replace(state=run.state.replace(pipeline_state=None, obs=None))
 
 
-def _fraction(part: float, whole: float) -> float:
+def _fraction(part: Any, whole: Any) -> float:
     return float(part / whole) if whole > 0 else 0.0
 
 

@@ -110,7 +110,7 @@ def frame(env: DrivingEnv, world: World, state: State, command: np.ndarray) -> I
     width = 2 * PANEL + 3 * MARGIN
     canvas = Image.new("RGB", (width, PANEL + TEXT_HEIGHT + 2 * MARGIN), BACKGROUND)
     canvas.paste(map_view(world, state), (MARGIN, MARGIN))
-    seen = Image.fromarray(image.bev_image(state.obs.raster, env.config.raster))
+    seen = Image.fromarray(image.bev_image(np.asarray(state.obs.raster), env.config.raster))
     canvas.paste(
         seen.resize((PANEL, PANEL), Image.Resampling.NEAREST), (PANEL + 2 * MARGIN, MARGIN)
     )
@@ -134,15 +134,16 @@ def map_view(world: World, state: State) -> Image.Image:
     ahead = near[near >= int(sim.route_idx)]
     if len(ahead) > 1:
         draw.line(pixels(world.route_xy[ahead[0] : ahead[-1] + 1]), fill=AHEAD, width=3)
-    for q in np.flatnonzero(world.stop_kind != STOP_NONE):
-        draw.line(
-            pixels(_stop_line(world, q)), fill=_stop_colour(world, q, sim.light_time), width=3
-        )
+    for q in range(len(world.stop_kind)):
+        if world.stop_kind[q] != STOP_NONE:
+            colour = _stop_colour(world, q, sim.light_time)
+            draw.line(pixels(_stop_line(world, q)), fill=colour, width=3)
     agents = sim.agents
-    for i in np.flatnonzero(np.isin(agents.kind, list(AGENT_COLOURS))):
-        box = _corners(agents.xy[i], agents.yaw[i], agents.length[i], agents.width[i])
-        draw.polygon(pixels(box), fill=AGENT_COLOURS[int(agents.kind[i])])
-    draw.polygon(pixels(_corners(sim.ego.xy, sim.ego.yaw, *world.ego_size)), fill=EGO)
+    poses = np.column_stack([agents.xy, agents.yaw, agents.length, agents.width])
+    for kind, colour in AGENT_COLOURS.items():
+        for x, y, *rest in poses[np.asarray(agents.kind) == kind]:
+            draw.polygon(pixels(_corners(np.array([x, y]), *rest)), fill=colour)
+    draw.polygon(pixels(_corners(centre, float(sim.ego.yaw), *world.ego_size)), fill=EGO)
     return view
 
 
@@ -176,7 +177,7 @@ def _stop_line(world: World, q: int) -> np.ndarray:
     return world.route_xy[min(idx, len(world.route_xy) - 1)] + np.stack([across, -across])
 
 
-def _stop_colour(world: World, q: int, light_time: float) -> tuple[int, int, int]:
+def _stop_colour(world: World, q: int, light_time: jax.Array) -> tuple[int, int, int]:
     if world.stop_kind[q] != STOP_LIGHT:
         return STOP
     light = int(world.stop_light[q])
@@ -208,8 +209,10 @@ def _draw_numbers(draw: ImageDraw.ImageDraw, state: State, command: np.ndarray, 
     penalty = f" x factors - {float(metrics['reward/penalty']):.0f}"
     draw.text((MARGIN, top + ROW * 5 + 4), reward + penalty, TEXT, font)
     happened = [name for name in metrics if name.endswith("_frac") and float(metrics[name]) > 0]
-    ends = ", ".join(name.removeprefix("episode/").removesuffix("_frac") for name in happened)
-    draw.text((MARGIN, top + ROW * 6 + 6), f"episode ended: {ends}" if ends else "", BAD, font)
+    names = ", ".join(name.removeprefix("episode/").removesuffix("_frac") for name in happened)
+    if names:
+        text = f"the end: {names}" if float(state.done) > 0 else names
+        draw.text((MARGIN, top + ROW * 6 + 6), text.replace("_", " "), BAD, font)
 
 
 def _bar(
