@@ -108,7 +108,7 @@ class DrivingEnv(struct.PyTreeNode):
         zero = jnp.zeros((), jnp.float32)
         return State(
             pipeline_state=sim,
-            obs=None,
+            obs=None,  # type: ignore[arg-type]
             reward=zero,
             done=zero,
             metrics=dict.fromkeys(METRICS, zero),
@@ -157,7 +157,7 @@ class DrivingEnv(struct.PyTreeNode):
         truncated = terms.timeout & ~ended
         return State(
             pipeline_state=after,
-            obs=None,
+            obs=None,  # type: ignore[arg-type]
             reward=paid,
             done=(ended | truncated).astype(jnp.float32),
             metrics=_metrics(state.metrics, after, seen, paid, terms, dt),

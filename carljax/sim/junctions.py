@@ -47,8 +47,8 @@ def build(network: RoadNetwork, table: LaneTable) -> JunctionTable:
         rows = members[i]
         slot[rows] = np.arange(len(rows))
         priority = set(network.junctions[name].priority) if name in network.junctions else set()
-        for a in rows:
-            for b in rows:
+        for a in rows.tolist():
+            for b in rows.tolist():
                 if a != b and fork[a] != fork[b] and _meet(table, a, b):
                     conflict[a, slot[b]] = _owes(network, table, a, b, priority)
     return JunctionTable(junction, slot, conflict, fork)

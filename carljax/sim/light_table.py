@@ -38,7 +38,8 @@ def build(network: RoadNetwork, table: LaneTable) -> LightTable:
             int(lane)
         )
     lane_light = np.full(len(table.length), -1)
-    cycle, start = [], []
+    cycle: list[float] = []
+    start: list[float] = []
     for number, name in enumerate(sorted(groups)):
         order = sorted(groups[name], key=lambda g: _sequence(network, name, g))
         period = lights.SLOT_S * max(2, len(order))

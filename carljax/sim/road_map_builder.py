@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -29,7 +30,7 @@ def build(towns: Sequence[Town], seed: int = 0) -> RoadMap:
 
 
 def _on_device(value: np.ndarray) -> jax.Array:
-    wanted = {"f": np.float32, "i": np.int32, "b": bool, "u": value.dtype}[value.dtype.kind]
+    wanted: Any = {"f": np.float32, "i": np.int32, "b": bool, "u": value.dtype}[value.dtype.kind]
     return jnp.asarray(value.astype(wanted))
 
 
@@ -83,7 +84,7 @@ def _lane_arrays(towns: Sequence[Town]) -> dict[str, np.ndarray]:
 def _atlases(towns: Sequence[Town], seed: int) -> dict[str, np.ndarray]:
     """Pixel atlases and respawn tables, all towns padded to the largest."""
     frames = [atlas.frame(t.network) for t in towns]
-    shape = tuple(max(f[1][axis] for f in frames) for axis in range(2))
+    shape = (max(f[1][0] for f in frames), max(f[1][1] for f in frames))
     extent = (shape[1] / PIXELS_PER_METRE, shape[0] / PIXELS_PER_METRE)
     out: dict[str, list[np.ndarray]] = {
         name: [] for name in ("layers", "nearest_point", "origin", "spawn_lane", "spawn_s")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 from flax import struct
@@ -84,7 +86,7 @@ def window(routes: Route, scenario_idx: jax.Array, route_idx: jax.Array) -> tupl
     start = jnp.clip(route_idx - WINDOW_BACK, 0, num - WINDOW)
 
     def stretch(rows: jax.Array) -> jax.Array:
-        begin = (scenario_idx, start, *[0] * (rows.ndim - 2))
+        begin: list[Any] = [scenario_idx, start, *[0] * (rows.ndim - 2)]
         return jax.lax.dynamic_slice(rows, begin, (1, WINDOW, *rows.shape[2:]))[0]
 
     whole = jax.tree.map(lambda x: x[scenario_idx], routes.replace(**dict.fromkeys(_POINT_FIELDS)))

@@ -8,6 +8,7 @@ paper, Scenario Generation, and the authors' generator.
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 
@@ -189,35 +190,41 @@ def _assemble(
         last = values[-1:] if fill is None else np.full((1, *values.shape[1:]), fill)
         return np.concatenate([values, np.repeat(last, size - len(values), axis=0)])
 
-    return Route(
-        xy=pad(pose[:, :2], sizes.num_points).astype(np.float32),
-        yaw=pad(pose[:, 2], sizes.num_points).astype(np.float32),
-        s=pad(s, sizes.num_points).astype(np.float32),
-        lane=pad(lane + first.lane, sizes.num_points).astype(np.int32),
-        lane_s=pad(lane_s, sizes.num_points).astype(np.float32),
-        speed_limit=pad(_limits(town, lane, signs), sizes.num_points).astype(np.float32),
-        in_junction=pad(in_junction, sizes.num_points),
-        num_points=np.int32(num),
-        length=np.float32(s[-1]),
-        z=np.float32(table.point_xyz[table.start[lane[0]] + int(lane_s[0]), 2]),
-        town=np.int32(first.town),
-        stop_idx=pad(_first_after(stops_at), sizes.num_stops, -1).astype(np.int32),
-        stop_xy=pad(line[:, :2], sizes.num_stops, 0.0).astype(np.float32),
-        stop_yaw=pad(line[:, 2], sizes.num_stops, 0.0).astype(np.float32),
-        stop_s=pad(np.interp(stops_at, np.arange(num), s), sizes.num_stops, 0.0).astype(np.float32),
-        stop_kind=pad(table.stop_kind[stop_lane], sizes.num_stops, STOP_NONE).astype(np.int32),
-        stop_light=pad(light[stop_lane], sizes.num_stops, -1).astype(np.int32),
-        stop_width=pad(line[:, 3], sizes.num_stops, 0.0).astype(np.float32),
-        sign_xy=pad(
+    # On the host: `scenario.make_bank` stacks the routes and puts them on the device.
+    fields: dict[str, Any] = {
+        "xy": pad(pose[:, :2], sizes.num_points).astype(np.float32),
+        "yaw": pad(pose[:, 2], sizes.num_points).astype(np.float32),
+        "s": pad(s, sizes.num_points).astype(np.float32),
+        "lane": pad(lane + first.lane, sizes.num_points).astype(np.int32),
+        "lane_s": pad(lane_s, sizes.num_points).astype(np.float32),
+        "speed_limit": pad(_limits(town, lane, signs), sizes.num_points).astype(np.float32),
+        "in_junction": pad(in_junction, sizes.num_points),
+        "num_points": np.int32(num),
+        "length": np.float32(s[-1]),
+        "z": np.float32(table.point_xyz[table.start[lane[0]] + int(lane_s[0]), 2]),
+        "town": np.int32(first.town),
+        "stop_idx": pad(_first_after(stops_at), sizes.num_stops, -1).astype(np.int32),
+        "stop_xy": pad(line[:, :2], sizes.num_stops, 0.0).astype(np.float32),
+        "stop_yaw": pad(line[:, 2], sizes.num_stops, 0.0).astype(np.float32),
+        "stop_s": pad(np.interp(stops_at, np.arange(num), s), sizes.num_stops, 0.0).astype(
+            np.float32
+        ),
+        "stop_kind": pad(table.stop_kind[stop_lane], sizes.num_stops, STOP_NONE).astype(np.int32),
+        "stop_light": pad(light[stop_lane], sizes.num_stops, -1).astype(np.int32),
+        "stop_width": pad(line[:, 3], sizes.num_stops, 0.0).astype(np.float32),
+        "sign_xy": pad(
             np.array([town.network.signals[i].xyz[:2] for _, i in signs]).reshape(-1, 2),
             sizes.num_signs,
             0.0,
         ).astype(np.float32),
-        sign_idx=pad(np.array([at for at, _ in signs], int), sizes.num_signs, -1).astype(np.int32),
-        sign_limit=pad(
+        "sign_idx": pad(np.array([at for at, _ in signs], int), sizes.num_signs, -1).astype(
+            np.int32
+        ),
+        "sign_limit": pad(
             np.array([town.network.signals[i].value for _, i in signs], float), sizes.num_signs, 0.0
         ).astype(np.float32),
-    )
+    }
+    return Route(**fields)
 
 
 def _sample(segments: list[_Segment], most: int) -> tuple[np.ndarray, np.ndarray]:
