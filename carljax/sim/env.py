@@ -25,6 +25,8 @@ from carljax.sim.scenario import ScenarioBank
 from carljax.sim.types import EgoState, RewardTerms, SimState, Situation, State
 
 ACTION_SIZE = 2
+# m/s^2. source: ours, brisker than the textbook's city drivers: a queue clears in a green of 10 s.
+TRAFFIC_ACCEL, TRAFFIC_BRAKE = 2.0, 3.0
 LIGHT_CLOCK = 600.0  # s, the light clock starts anywhere in it
 
 
@@ -193,7 +195,7 @@ def make_env(bank: ScenarioBank, config: EnvConfig, reward_config: RewardConfig)
         bank=bank,
         reward_config=reward_config,
         vehicle=VehicleParams(),
-        idm=IDMParams(),
+        idm=IDMParams(accel_max=TRAFFIC_ACCEL, comfort_brake=TRAFFIC_BRAKE),
         config=config,
     )
 

@@ -26,6 +26,9 @@ YS = (0.0, 90.0, 190.0, 280.0)
 AVENUE_COLUMN, AVENUE_ROW = 2, 1
 # A crossing that is out of line, so that the streets around it wind a little, m.
 MOVED = {(1, 2): (6.0, -5.0), (3, 2): (-5.0, 7.0)}
+# The crossing whose arms are served one at a time, as CARLA does; elsewhere opposing arms go
+# together.
+ONE_BY_ONE = (2, 2)
 STREET_SPEED, AVENUE_SPEED = 30.0, 50.0
 CORNER_RADIUS, CORNER_EASING = 20.0, 12.0
 # Room for a right turn of 8.5 m radius at the lane centre, m.
@@ -138,7 +141,7 @@ def _add_crossing(town: Town, at: dict[float, Arm], node: Node) -> None:
     connect_all(town, junction)
     pairs = [[at[d] for d in pair if d in at] for pair in ((EAST, WEST), (NORTH, SOUTH))]
     one_by_one = [[at[d]] for d in (EAST, NORTH, WEST, SOUTH) if d in at]
-    signs.add_lights(town, junction, pairs if sum(node) % 2 else one_by_one)
+    signs.add_lights(town, junction, one_by_one if node == ONE_BY_ONE else pairs)
     for direction, arm in at.items():
         signs.add_stop_line(town, arm)
         if direction in (EAST, WEST) or len(at) == 4:
