@@ -1,0 +1,1 @@
+"""PPO: policy, network, rollout, advantages, loss and the one jitted train step."""

@@ -1,12 +1,13 @@
 """Convolutions whose gradients are fast on XLA:CPU inside `lax.scan`, where the plain ones are not.
 
-On a CPU the weight gradient of a convolution in a loop body keeps a layout that no fast kernel takes
-(22 to 75 times slower), input gradients run on one thread, and a matrix product that contracts over
-the rows of two tall matrices is three times slower than the same with one of them transposed. The
-functions here write out the fast forms. GPUs and TPUs have no such trouble and get the plain ones.
+On a CPU the weight gradient of a convolution in a loop body keeps a layout that no fast kernel
+takes (22 to 75 times slower), input gradients run on one thread, and a matrix product that
+contracts over the rows of two tall matrices is three times slower than the same with one of them
+transposed. The functions here write out the fast forms. GPUs and TPUs have no such trouble and get
+the plain ones.
 
-The platform is chosen at lowering (`lax.platform_dependent`), not by `jax.default_backend()` at trace
-time: a program traced on a machine with a GPU may still be compiled for its CPU devices.
+The platform is chosen at lowering (`lax.platform_dependent`), not by `jax.default_backend()` at
+trace time: a program traced on a machine with a GPU may still be compiled for its CPU devices.
 """
 
 from __future__ import annotations
@@ -141,8 +142,8 @@ def patch_conv(x: jax.Array, w: jax.Array, size: int) -> jax.Array:
 def _patch_rows(x: jax.Array, size: int) -> list[jax.Array]:
     """Returns, for each row of a patch, (patches, size * I) float32.
 
-    A row of a patch is contiguous in the image. To work on one at a time costs no transpose, and the
-    float32 copy of a small image's row fits the cache where that of the image doesn't.
+    A row of a patch is contiguous in the image. To work on one at a time costs no transpose, and
+    the float32 copy of a small image's row fits the cache where that of the image doesn't.
     """
     num, height, width, channels = x.shape
     x = x.reshape(num, height // size, size, width // size, size * channels)

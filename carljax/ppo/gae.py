@@ -20,9 +20,10 @@ def gae(
 ) -> jax.Array:
     """Computes A_t = sum_k (gamma lambda)^k delta_{t+k} within each episode.
 
-    delta_t = r_t + gamma (1 - terminated_t) V_{t+1} - V_t. With next-step autoreset the step after an
-    episode's end still shows its final observation, so V_{t+1} is the value to bootstrap from. That
-    step has weight 0, its own advantage is 0 and nothing flows past it into the earlier episode.
+    delta_t = r_t + gamma (1 - terminated_t) V_{t+1} - V_t. With next-step autoreset the step after
+    an episode's end still shows its final observation, so V_{t+1} is the value to bootstrap from.
+    That step has weight 0, its own advantage is 0 and nothing flows past it into the earlier
+    episode.
 
     Args:
       reward: (T, B) float32.

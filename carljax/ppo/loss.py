@@ -1,7 +1,7 @@
 """The PPO loss: clipped surrogate, clipped value loss, entropy bonus.
 
-Source: Schulman et al., Proximal policy optimization algorithms (2017), eq. 7 and 9; the value clip and
-the half before the squared error as in the CaRL paper's trainer.
+Source: Schulman et al., Proximal policy optimization algorithms (2017), eq. 7 and 9; the value
+clip and the half before the squared error as in the CaRL paper's trainer.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import jax.numpy as jnp
 
 from carljax.ppo import beta
 from carljax.ppo.config import PPOConfig
-from carljax.ppo.networks import ActorCritic
+from carljax.ppo.networks import ActorCritic, forward
 from carljax.ppo.types import Minibatch
 
 
@@ -32,10 +32,10 @@ def loss(
       config: clip ranges and coefficients.
 
     Returns:
-      () loss and {name: ()} its parts, approx_kl (Schulman's estimator (r - 1) - log r) and clip_frac,
-      the share of samples whose ratio left the clip range.
+      () loss and {name: ()} its parts, approx_kl (Schulman's estimator (r - 1) - log r) and
+      clip_frac, the share of samples whose ratio left the clip range.
     """
-    alpha, beta_, value = network.apply(params, minibatch.obs)
+    alpha, beta_, value = forward(network, params, minibatch.obs)
     log_prob = beta.log_prob(minibatch.action, alpha, beta_)
     log_ratio = log_prob - minibatch.log_prob
     ratio = jnp.exp(log_ratio)

@@ -1,11 +1,13 @@
 """The actor-critic: image encoder, scalar branch, joint trunk, Beta policy head, asymmetric critic.
 
 Source: CaRL paper, "Architecture", after Roach (Zhang et al. 2021). Every layer is linear or
-convolution, then LayerNorm, then ReLU; the LayerNorm of a convolution spans height, width and channels
-together and has an affine weight for each. The critic alone sees the value scalars.
+convolution, then LayerNorm, then ReLU; the LayerNorm of a convolution spans height, width and
+channels together and has an affine weight for each. The critic alone sees the value scalars.
 """
 
 from __future__ import annotations
+
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -64,6 +66,14 @@ class ActorCritic(nn.Module):
         return alpha, beta, Linear(1, name="value")(critic)[..., 0]
 
 
+def forward(
+    network: ActorCritic, params: Any, obs: Observation
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Returns `network.apply(params, obs)`, which flax leaves without a type."""
+    outputs: Any = network.apply(params, obs)
+    return outputs
+
+
 class Linear(nn.Module):
     """A linear layer with PyTorch's default initialisation, uniform in +-1 / sqrt(inputs)."""
 
@@ -101,10 +111,10 @@ class Mlp(nn.Module):
 class ConvEncoder(nn.Module):
     """The paper's convolutions, for an image of any size.
 
-    At 256 px (carl) and 192 px (roach) this is the paper's network. A smaller image would vanish on the
-    way: a layer whose output would have less than 2 rows or columns is padded as "SAME" at its stride,
-    and if that is still too small its stride becomes 1. So 64 and 128 px end in 2 x 2 x 256 features
-    too.
+    At 256 px (carl) and 192 px (roach) this is the paper's network. A smaller image would vanish
+    on the way: a layer whose output would have less than 2 rows or columns is padded as "SAME" at
+    its stride, and if that is still too small its stride becomes 1. So 64 and 128 px end in 2 x 2
+    x 256 features too.
     """
 
     config: NetworkConfig
@@ -126,9 +136,7 @@ class ConvEncoder(nn.Module):
         return x.reshape(x.shape[0], -1)
 
 
-def conv_fit(
-    size: tuple[int, ...], kernel: int, stride: int
-) -> tuple[list[tuple[int, int]], int]:
+def conv_fit(size: tuple[int, ...], kernel: int, stride: int) -> tuple[list[tuple[int, int]], int]:
     """Chooses padding and stride of a layer by the rule of `ConvEncoder`.
 
     Args:

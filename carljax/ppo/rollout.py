@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 
 from carljax.ppo import beta
-from carljax.ppo.networks import ActorCritic
+from carljax.ppo.networks import ActorCritic, forward
 from carljax.ppo.types import Transition
 from carljax.sim import autoreset
 from carljax.sim.autoreset import Env
@@ -43,7 +43,7 @@ def rollout(
 
     def step(env_state: State, t: jax.Array) -> tuple[State, tuple[Transition, dict]]:
         keys_t = jax.vmap(lambda key: jax.random.split(jax.random.fold_in(key, t)))(keys)
-        alpha, beta_, value = network.apply(params, env_state.obs)
+        alpha, beta_, value = forward(network, params, env_state.obs)
         action = jax.vmap(beta.sample)(keys_t[:, 0], alpha, beta_)
         command = beta.to_command(action)
         autostep = jax.vmap(autoreset.step, in_axes=(None, 0, 0, 0))
@@ -61,12 +61,12 @@ def rollout(
         return next_state, (transition, _metric_sums(next_state, transition.weight))
 
     env_state, (batch, sums) = jax.lax.scan(step, env_state, jnp.arange(num_steps))
-    _, _, last_value = network.apply(params, env_state.obs)
+    _, _, last_value = forward(network, params, env_state.obs)
     return env_state, batch, last_value, jax.tree.map(lambda x: jnp.sum(x, axis=0), sums)
 
 
 def _metric_sums(state: State, weight: jax.Array) -> dict[str, jax.Array]:
-    """Sums metrics over environments: `episode/` ones where an episode ended, others where it ran."""
+    """Sums metrics over environments: `episode/` where an episode ended, others where it ran."""
     sums = {}
     for name, metric in state.metrics.items():
         mask = state.done if name.startswith(EPISODE_PREFIX) else weight
@@ -85,8 +85,8 @@ def mean_metrics(
       num_episodes: () float32, episodes that ended.
 
     Returns:
-      {name: ()} means per step, or for names with `episode/` per ended episode (0 if none ended), and
-      their number as `episode/num`.
+      {name: ()} means per step, or for names with `episode/` per ended episode (0 if none ended),
+      and their number as `episode/num`.
     """
     means = {}
     for name, total in sums.items():

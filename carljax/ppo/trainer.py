@@ -1,7 +1,7 @@
 """The one XLA program: rollout, advantages and update of all devices as one jitted function.
 
-Environments are shared out over the mesh axis "data"; parameters, optimiser state and the environment's
-constant arrays are on every device. A mesh of one device runs the same code.
+Environments are shared out over the mesh axis "data"; parameters, optimiser state and the
+environment's constant arrays are on every device. A mesh of one device runs the same code.
 """
 
 from __future__ import annotations
@@ -30,13 +30,14 @@ from carljax.ppo.update import (
 )
 from carljax.sim.autoreset import Env
 
-_SPEC = TrainState(
-    params=PartitionSpec(),
-    opt_state=PartitionSpec(),
-    env_state=PartitionSpec(AXIS),
-    key=PartitionSpec(),
-    update=PartitionSpec(),
-)
+_PLACES: dict[str, Any] = {
+    "params": PartitionSpec(),
+    "opt_state": PartitionSpec(),
+    "env_state": PartitionSpec(AXIS),
+    "key": PartitionSpec(),
+    "update": PartitionSpec(),
+}
+_SPEC = TrainState(**_PLACES)
 
 TrainStep = Callable[[Env, TrainState], tuple[TrainState, dict[str, jax.Array]]]
 
@@ -117,8 +118,9 @@ def make_train_step(network: ActorCritic, config: PPOConfig, mesh: Mesh) -> Trai
     """
     config.validate(mesh.size)
     local = functools.partial(_local_step, network=network, config=config)
-    # Without check_vma a simulator may start its inner loops from constants, which vary over no device.
-    # Nothing here rests on it: no collective is differentiated, and a test compares 1 and 4 devices.
+    # Without check_vma a simulator may start its inner loops from constants, which vary over no
+    # device. Nothing here rests on it: no collective is differentiated, and a test compares 1 and
+    # 4 devices.
     sharded = jax.shard_map(
         local,
         mesh=mesh,
@@ -127,8 +129,8 @@ def make_train_step(network: ActorCritic, config: PPOConfig, mesh: Mesh) -> Trai
         check_vma=False,
     )
     options = compiler_options(mesh.devices.flat[0].platform)
-    # Said outright: on one device the compiler would call the result's sharding by another name than
-    # that of the first state, and the second call would compile once more.
+    # Said outright: on one device the compiler would call the result's sharding by another name
+    # than that of the first state, and the second call would compile once more.
     out = (shardings(mesh), NamedSharding(mesh, PartitionSpec()))
     return jax.jit(sharded, donate_argnums=1, out_shardings=out, compiler_options=options)
 
@@ -161,8 +163,12 @@ def _local_step(
     metrics["ppo/explained_variance"] = explained_variance(samples)
     metrics["ppo/learning_rate"] = rate
     metrics |= _rollout_metrics(metric_sums, batch)
-    train_state = train_state.replace(
-        params=params, opt_state=opt_state, env_state=env_state, update=train_state.update + 1
+    train_state = TrainState(
+        params=params,
+        opt_state=opt_state,
+        env_state=env_state,
+        key=train_state.key,
+        update=train_state.update + 1,
     )
     return train_state, metrics
 
@@ -194,9 +200,11 @@ def make_samples(batch: Transition, last_value: jax.Array, config: PPOConfig) ->
 
 
 def _rollout_metrics(sums: dict[str, jax.Array], batch: Transition) -> dict[str, jax.Array]:
-    sums = {**sums, "rollout/reward": jnp.sum(batch.reward), "rollout/value": jnp.sum(
-        batch.value * batch.weight
-    )}
+    sums = {
+        **sums,
+        "rollout/reward": jnp.sum(batch.reward),
+        "rollout/value": jnp.sum(batch.value * batch.weight),
+    }
     counts = (jnp.sum(batch.weight), jnp.sum(batch.done))
     sums, counts = jax.lax.psum((sums, counts), AXIS)
     return mean_metrics(sums, *counts)

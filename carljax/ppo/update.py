@@ -3,8 +3,8 @@
 Each device shuffles its own share of the batch; statistics, gradients and metrics are those of the
 minibatch of all devices together. Gradients are those of a device's own samples, added up once per
 minibatch by an explicit `psum` outside of what is differentiated. That needs `shard_map` without
-`check_vma` (see `trainer.make_train_step`): with it, gradients of replicated parameters come out summed
-already, once per micro-batch, and the `psum` would count them again.
+`check_vma` (see `trainer.make_train_step`): with it, gradients of replicated parameters come out
+summed already, once per micro-batch, and the `psum` would count them again.
 """
 
 from __future__ import annotations
@@ -81,7 +81,8 @@ def update(
     def gradient_step(carry: tuple, rows: jax.Array) -> tuple[tuple, dict[str, jax.Array]]:
         params, opt_state = carry
         grads, metrics = minibatch_gradient(params, samples, rows, network, config)
-        metrics["grad_norm"] = optax.global_norm(grads)
+        squares = [jnp.sum(jnp.square(grad)) for grad in jax.tree.leaves(grads)]
+        metrics["grad_norm"] = jnp.sqrt(sum(squares))
         direction, opt_state = optimizer.update(grads, opt_state)
         params = jax.tree.map(lambda p, d: p - rate * d, params, direction)
         return (params, opt_state), metrics
@@ -159,7 +160,7 @@ def normalise(advantage: jax.Array, weight: jax.Array) -> jax.Array:
 
 
 def explained_variance(samples: Minibatch) -> jax.Array:
-    """Returns () 1 - Var(target - value) / Var(target) over all devices; 0 if the target is constant."""
+    """Returns () 1 - Var(target - value) / Var(target) over all devices; 0 for constant targets."""
     weight = samples.weight / jnp.maximum(jax.lax.psum(jnp.sum(samples.weight), AXIS), 1.0)
 
     def variance(x: jax.Array) -> jax.Array:

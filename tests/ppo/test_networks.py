@@ -1,0 +1,158 @@
+"""The actor-critic: the paper's size and initialisation, any input size, who sees what."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from carljax.ppo.config import NetworkConfig
+from carljax.ppo.networks import CONV_LAYERS, ActorCritic, conv_fit
+from carljax.sim.types import Observation
+
+
+def _obs(num, size, channels=10, scalars=8, value_scalars=10):
+    rng = np.random.default_rng(0)
+    return Observation(
+        raster=jnp.asarray(rng.integers(0, 256, (num, size, size, channels)), jnp.uint8),
+        scalars=jnp.asarray(rng.normal(size=(num, scalars)), jnp.float32),
+        value_scalars=jnp.asarray(rng.normal(size=(num, value_scalars)), jnp.float32),
+    )
+
+
+def _num_params(network, obs):
+    shapes = jax.eval_shape(network.init, jax.random.key(0), obs)
+    return sum(x.size for x in jax.tree.leaves(shapes))
+
+
+@pytest.mark.parametrize(
+    ("config", "obs", "expected"),
+    [
+        # conv 421,600 + their LayerNorm 435,024 + scalars 69,120 + joint 788,736 + policy 133,636
+        # + value 135,425. source: CaRL paper's network, counted layer by layer.
+        (NetworkConfig(), dict(size=256), 1_983_541),
+        # nuPlan: 9 channels, 10 scalars, 4 value scalars: 200 weights of the first convolution and
+        # 6 x 256 of the critic less, 2 x 256 of the scalar branch more than 1,983,541.
+        (NetworkConfig(), dict(size=256, channels=9, scalars=10, value_scalars=4), 1_982_317),
+        # Roach without LayerNorm: 15 channels, 6 scalars, no critic inputs.
+        (
+            NetworkConfig(encoder="roach", layer_norm=False),
+            dict(size=192, channels=15, scalars=6, value_scalars=0),
+            1_525_813,
+        ),
+    ],
+    ids=["carl-carla", "carl-nuplan", "roach"],
+)
+def test_parameter_count_is_the_papers(config, obs, expected):
+    assert _num_params(ActorCritic(config), _obs(1, **obs)) == expected
+
+
+@pytest.mark.parametrize(
+    ("encoder", "size"), [("carl", 7), ("carl", 64), ("roach", 20), ("patch", 20)]
+)
+def test_any_image_size_works(encoder, size):
+    network = ActorCritic(NetworkConfig(encoder=encoder))
+    obs = _obs(3, size)
+    params = jax.jit(network.init)(jax.random.key(0), obs)
+    alpha, beta, value = jax.jit(network.apply)(params, obs)
+    assert alpha.shape == beta.shape == (3, 2)
+    assert value.shape == (3,)
+    assert np.all(np.asarray(alpha) > 1.0)
+    assert np.all(np.asarray(beta) > 1.0)
+    assert np.all(np.isfinite(value))
+
+
+def _last_size(encoder, size):
+    for _, kernel, stride in CONV_LAYERS[encoder]:
+        (padding, _), stride = conv_fit((size, size), kernel, stride)
+        size = (size + sum(padding) - kernel) // stride + 1
+    return size
+
+
+def test_small_images_keep_four_cells():
+    """The rule of ConvEncoder, worked by hand for the seven layers at 64 px.
+
+    64 -5/2-> 30 -5/2-> 13 -5/2-> 5; valid would leave 1, so SAME/2: 3; 3/2 SAME: 2; 2; 2.
+    """
+    assert conv_fit((64, 64), 5, 2) == ([(0, 0), (0, 0)], 2)
+    # Size 5, kernel 5, stride 2: 3 outputs span (3 - 1) * 2 + 5 = 9, that is 4 more than 5.
+    assert conv_fit((5, 5), 5, 2) == ([(2, 2), (2, 2)], 2)
+    # Size 2, stride 2 would leave one output even padded: stride 1, 2 + 2 = 1 + 3.
+    assert conv_fit((2, 2), 3, 2) == ([(1, 1), (1, 1)], 1)
+    assert [_last_size("carl", size) for size in (32, 64, 96, 128, 256)] == [2] * 5
+    assert [_last_size("roach", size) for size in (64, 192)] == [2, 2]
+
+
+def test_initialisation_is_the_papers():
+    network = ActorCritic(NetworkConfig())
+    params = jax.jit(network.init)(jax.random.key(0), _obs(1, 32))["params"]
+    np.testing.assert_array_equal(params["encoder"]["bias_3"], np.full(32, 0.1, np.float32))
+    # Xavier uniform, gain sqrt(2): bound sqrt(2) sqrt(6 / (fan_in + fan_out)); 25 taps, 24 -> 32.
+    bound = np.sqrt(2.0 * 6.0 / (25 * 24 + 25 * 32))
+    largest = np.max(np.abs(params["encoder"]["kernel_3"]))
+    assert 0.99 * bound < largest <= bound
+    # PyTorch's linear layer: both within 1 / sqrt(256).
+    layer = params["policy_mlp"]["Linear_0"]
+    for name in ("kernel", "bias"):
+        assert 0.9 / 16.0 < np.max(np.abs(layer[name])) <= 1.0 / 16.0
+
+
+@pytest.mark.parametrize("encoder", ["carl", "patch"])
+def test_encoder_equals_a_numpy_one(encoder):
+    """Float64 loops over windows: convolution, LayerNorm over the layer's axes, ReLU."""
+    config = NetworkConfig(encoder=encoder, patch_size=4, patch_features=(3, 5))
+    network = ActorCritic(config)
+    obs = _obs(2, 20, channels=2)
+    variables = jax.jit(network.init)(jax.random.key(0), obs)
+    _, state = network.apply(variables, obs, capture_intermediates=True)
+    actual = state["intermediates"]["encoder"]["__call__"][0]
+    params = jax.tree.map(np.float64, variables["params"]["encoder"])
+    x = np.float64(obs.raster) / 255.0
+    if encoder == "patch":
+        layers, axes = [(4, 4), (2, 2)], (-1,)
+    else:
+        layers, axes = [(5, 2), (5, 2), (5, 2), (5, 2), (3, 2), (3, 1), (3, 1)], (-3, -2, -1)
+    for i, (kernel, stride) in enumerate(layers):
+        if encoder == "patch":
+            pad = [(0, -x.shape[1] % kernel)] * 2
+        else:
+            pad, stride = conv_fit(x.shape[1:3], kernel, stride)
+        x = np.pad(x, ((0, 0), *pad, (0, 0)))
+        size = (x.shape[1] - kernel) // stride + 1
+        weight = params[f"kernel_{i}"]
+        out = np.zeros((2, size, size, weight.shape[-1]))
+        for row in range(size):
+            for col in range(size):
+                r, c = row * stride, col * stride
+                window = x[:, r : r + kernel, c : c + kernel]
+                out[:, row, col] = np.tensordot(window, weight, 3) + params[f"bias_{i}"]
+        centred = out - out.mean(axes, keepdims=True)
+        out = centred / np.sqrt((centred**2).mean(axes, keepdims=True) + 1e-5)
+        norm = params[f"LayerNorm_{i}"]
+        x = np.maximum(out * norm["scale"] + norm["bias"], 0.0)
+    np.testing.assert_allclose(actual, x.reshape(2, -1), atol=2e-4)
+
+
+def test_only_the_critic_sees_the_value_scalars():
+    network = ActorCritic(NetworkConfig(encoder="patch"))
+    obs = _obs(2, 16)
+    params = network.init(jax.random.key(0), obs)
+    other = obs.replace(value_scalars=obs.value_scalars + 1.0)
+    alpha, beta, value = network.apply(params, obs)
+    alpha_2, beta_2, value_2 = network.apply(params, other)
+    np.testing.assert_array_equal(alpha, alpha_2)
+    np.testing.assert_array_equal(beta, beta_2)
+    assert np.all(np.abs(value - value_2) > 1e-4)
+    alpha_3, _, _ = network.apply(params, obs.replace(scalars=obs.scalars + 1.0))
+    assert np.all(np.abs(alpha - alpha_3) > 1e-6)
+
+
+def test_beta_min_bounds_alpha_and_beta():
+    obs = _obs(2, 16)
+    outputs = []
+    for beta_min in (0.0, 1.0):
+        network = ActorCritic(NetworkConfig(encoder="patch", beta_min=beta_min))
+        outputs.append(network.apply(network.init(jax.random.key(0), obs), obs))
+    for lower, higher in zip(outputs[0][:2], outputs[1][:2], strict=True):
+        np.testing.assert_allclose(higher - lower, 1.0, atol=1e-6)

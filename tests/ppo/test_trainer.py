@@ -1,0 +1,208 @@
+"""The whole train step in the toy environment: learns, traces once, resumes, shares out."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import toy_env
+
+from carljax.ppo import trainer
+from carljax.ppo.config import NetworkConfig, PPOConfig
+from carljax.ppo.networks import ActorCritic
+
+NETWORK = ActorCritic(
+    NetworkConfig(
+        encoder="patch", hidden_size=32, joint_size=32, patch_size=4, patch_features=(8, 16)
+    )
+)
+CONFIG = PPOConfig(
+    total_samples=20 * 16 * 32,
+    num_envs=16,
+    num_steps=32,
+    # One minibatch: a device's own shuffle doesn't matter, and 1 and 4 devices may be compared.
+    num_minibatches=1,
+    update_epochs=8,
+    micro_batch_size=64,
+    learning_rate=4e-3,
+    clip_coef=0.2,
+    clip_vloss=None,
+)
+
+
+class Run:
+    """A compiled train step and what it needs."""
+
+    def __init__(self, num_devices):
+        self.mesh = trainer.make_mesh(num_devices)
+        self.env = trainer.replicate(toy_env.make(), self.mesh)
+        self.first = trainer.init(jax.random.key(0), self.env, NETWORK, CONFIG, self.mesh)
+        with pytest.MonkeyPatch.context() as patch:
+            traced = chex.assert_max_traces(trainer._local_step, n=1)
+            patch.setattr(trainer, "_local_step", traced)
+            self.train_step = trainer.make_train_step(NETWORK, CONFIG, self.mesh)
+
+    def start(self):
+        """Returns a copy of the first training state, for the train step to consume."""
+        return self.copy(self.first)
+
+    def copy(self, train_state):
+        """Copies a training state through the host, as a checkpoint does."""
+        return jax.device_put(_host(train_state), trainer.shardings(self.mesh))
+
+    def updates(self, train_state, num):
+        """Runs updates, each traced at most once; returns the state and the metrics of each."""
+        history = []
+        for _ in range(num):
+            train_state, metrics = self.train_step(self.env, train_state)
+            history.append(jax.tree.map(float, metrics))
+        return train_state, history
+
+
+@pytest.fixture(scope="module")
+def one_device():
+    return Run(1)
+
+
+@pytest.fixture(scope="module")
+def four_devices():
+    return Run(4)
+
+
+def _is_key(x):
+    return jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
+
+
+def _host(tree):
+    """Copies to NumPy; keys stay keys, on one device."""
+
+    def copy(x):
+        if _is_key(x):
+            return jax.random.wrap_key_data(np.array(jax.random.key_data(x)))
+        return np.array(x)
+
+    return jax.tree.map(copy, tree)
+
+
+def _data(tree):
+    """Copies to NumPy, keys as their data."""
+    return jax.tree.map(lambda x: np.array(jax.random.key_data(x) if _is_key(x) else x), tree)
+
+
+def test_learns_to_keep_the_dot_in_the_middle(one_device):
+    train_state, history = one_device.updates(one_device.start(), 20)
+    # Actions drawn at random leave the image in the middle of most episodes.
+    assert history[0]["toy/distance"] > 0.35
+    assert history[-1]["toy/distance"] < 0.2
+    assert history[-1]["rollout/reward"] > 0.75
+    assert history[-1]["episode/length"] == 32.0
+    assert all(np.isfinite(value) for metrics in history for value in metrics.values())
+    assert int(train_state.update) == 20
+    np.testing.assert_allclose(history[5]["ppo/learning_rate"], 4e-3 * (1 - 5 / 20), rtol=1e-6)
+
+
+def test_metrics_are_scalars_of_these_names(one_device):
+    _, metrics = one_device.train_step(one_device.env, one_device.start())
+    assert set(metrics) == {
+        "episode/length",
+        "episode/num",
+        "ppo/approx_kl",
+        "ppo/clip_frac",
+        "ppo/entropy",
+        "ppo/explained_variance",
+        "ppo/grad_norm",
+        "ppo/learning_rate",
+        "ppo/policy_loss",
+        "ppo/value_loss",
+        "rollout/reward",
+        "rollout/value",
+        "toy/distance",
+    }
+    for metric in metrics.values():
+        assert metric.shape == ()
+        assert metric.dtype == jnp.float32
+
+
+def test_resumed_run_is_the_same_bit_for_bit(one_device):
+    through, history = one_device.updates(one_device.start(), 4)
+    half, _ = one_device.updates(one_device.start(), 2)
+    resumed, later = one_device.updates(one_device.copy(half), 2)
+    chex.assert_trees_all_equal(_data(through), _data(resumed))
+    assert history[2:] == later
+
+
+def test_runs_with_other_keys_differ(one_device):
+    other = one_device.copy(one_device.first.replace(key=jax.random.key(7)))
+    (_, first), (_, second) = (
+        one_device.updates(state, 1) for state in (one_device.start(), other)
+    )
+    assert first[0]["rollout/reward"] != second[0]["rollout/reward"]
+
+
+def test_four_devices_do_what_one_does(one_device, four_devices):
+    states, metrics = zip(
+        *[run.updates(run.start(), 2) for run in (one_device, four_devices)], strict=True
+    )
+    one, four = map(_data, states)
+    chex.assert_trees_all_close(
+        one.env_state.pipeline_state, four.env_state.pipeline_state, atol=1e-3
+    )
+    for before, after in zip(*metrics, strict=True):
+        for name, value in before.items():
+            np.testing.assert_allclose(value, after[name], rtol=2e-3, atol=1e-4, err_msg=name)
+    chex.assert_trees_all_close(one.params, four.params, atol=1e-3)
+    moved = jax.tree.map(
+        lambda a, b: np.max(np.abs(a - b)), one.params, _data(one_device.first.params)
+    )
+    assert max(jax.tree.leaves(moved)) > 0.02
+
+
+def test_compiled_once(one_device, four_devices):
+    """A first state placed otherwise than the later ones would compile the program twice."""
+    for run in (one_device, four_devices):
+        run.updates(run.start(), 2)
+        assert run.train_step._cache_size() == 1
+
+
+def test_state_is_where_the_mesh_wants_it(four_devices):
+    later, _ = four_devices.updates(four_devices.start(), 1)
+    for train_state in (four_devices.first, later):
+        assert all(x.is_fully_replicated for x in jax.tree.leaves(train_state.params))
+        for leaf in jax.tree.leaves(train_state.env_state):
+            assert len(leaf.sharding.device_set) == 4
+            assert leaf.addressable_shards[0].data.shape[0] == CONFIG.num_envs // 4
+
+
+@pytest.mark.parametrize(
+    ("change", "num_devices", "message"),
+    [
+        (dict(num_envs=6), 4, "ppo.num_envs is 6, which devices = 4 does not divide"),
+        (dict(num_minibatches=7), 1, "is 512, which ppo.num_minibatches = 7 does not divide"),
+        (dict(num_minibatches=8), 1, "is 64, which ppo.micro_batch_size = 48 does not divide"),
+        (dict(num_steps=0), 1, "ppo.num_steps must be at least 1, not 0"),
+    ],
+    ids=["devices", "minibatches", "micro-batches", "zero"],
+)
+def test_sizes_that_do_not_divide_are_named(change, num_devices, message):
+    config = dataclasses.replace(CONFIG, micro_batch_size=48, **change)
+    with pytest.raises(ValueError, match=message):
+        trainer.make_train_step(NETWORK, config, trainer.make_mesh(num_devices))
+
+
+def test_derived_sizes():
+    config = PPOConfig()  # source: CaRL paper, 300 M samples of 128 x 512: 4577.6 updates
+    assert (config.batch_size, config.minibatch_size, config.num_updates) == (65536, 16384, 4578)
+
+
+def test_more_devices_than_there_are():
+    with pytest.raises(ValueError, match="99 devices were asked for, but there are 4"):
+        trainer.make_mesh(99)
+
+
+def test_compiler_options_are_for_cpus_that_know_them():
+    assert trainer.compiler_options("cuda") is None
+    assert not trainer._is_known((("xla_there_is_no_such_option", ""),))
