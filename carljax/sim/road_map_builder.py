@@ -90,10 +90,9 @@ def _atlases(towns: Sequence[Town], seed: int) -> dict[str, np.ndarray]:
         name: [] for name in ("layers", "nearest_point", "origin", "spawn_lane", "spawn_s")
     }
     for town, first, (origin, _) in zip(towns, offsets(towns), frames, strict=True):
-        rng = np.random.default_rng(seed)
         table = town.lanes
         nearest = atlas.nearest_point(table.point_xyz[:, :2], origin, shape)
-        lane, s = spawn.respawn_table(spawn.places(table), origin, extent, rng)
+        lane, s = spawn.respawn_table(spawn.places(table), origin, extent, seed)
         out["layers"].append(atlas.layers(town.network, origin, shape))
         out["nearest_point"].append(_shift(np.asarray(nearest), first.point))
         out["origin"].append(origin)

@@ -41,11 +41,13 @@ def places(table: LaneTable) -> Places:
         s.append(at)
         xyz = table.point_xyz[points]
         xy.append(np.stack([np.interp(at, known, xyz[:, i]) for i in range(2)], axis=-1))
+    if not lane:  # a town that is all junctions
+        return Places(np.zeros(0, int), np.zeros(0), np.zeros((0, 2)))
     return Places(np.concatenate(lane), np.concatenate(s), np.concatenate(xy))
 
 
 def respawn_table(
-    found: Places, origin: np.ndarray, extent: tuple[float, float], rng: np.random.Generator
+    found: Places, origin: np.ndarray, extent: tuple[float, float], seed: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """For each grid cell the ego may be in, places in a ring around it.
 
@@ -53,7 +55,8 @@ def respawn_table(
       found: the town's places.
       origin: (2,) lower left corner of the grid, m.
       extent: width and height of the grid, m.
-      rng: chooses where a ring holds more than `CANDIDATES` places.
+      seed: of the choice where a ring holds more than `CANDIDATES` places; each cell chooses by
+        itself, so that a larger grid changes nothing.
 
     Returns:
       lane (Gy, Gx, C) int, -1 pads; s (Gy, Gx, C) m.
@@ -71,7 +74,7 @@ def respawn_table(
             if len(near) == 0:
                 continue
             near = near[np.hypot(*(found.xy[near] - centre).T) > RING[0]]
-            near = rng.permutation(near)[:CANDIDATES]
+            near = np.random.default_rng([seed, row, column]).permutation(near)[:CANDIDATES]
             lane[row, column, : len(near)] = found.lane[near]
             s[row, column, : len(near)] = found.s[near]
     return lane, s
