@@ -138,9 +138,7 @@ def _causes(
         ),
         "blocked": blocked.is_blocked(stopped_s, config.blocked_s, dt),
     }
-    memory = memory.replace(
-        route_s=route_s, stopped_s=stopped_s, far_from_route_m=far
-    )
+    memory = memory.replace(route_s=route_s, stopped_s=stopped_s, far_from_route_m=far)
     return memory, causes
 
 
@@ -169,9 +167,7 @@ def _stop_lines(
     )
     ran_light = forbidden(at_light, situation.stop_kind, situation.stop_light)
     ran_sign = stop_sign.ran_stop_sign(at_sign, situation.stop_kind, satisfied)
-    memory = old.replace(
-        stop_satisfied=satisfied, line_crossed=old.line_crossed | at_light
-    )
+    memory = old.replace(stop_satisfied=satisfied, line_crossed=old.line_crossed | at_light)
     return memory, ran_light, ran_sign
 
 
@@ -208,9 +204,7 @@ def _soft_factors(
         "ttc": ttc.factor(ttc_ticks, config.ttc_factor),
         "comfort": comfort.factor(comfort_ticks, config.comfort_weight),
     }
-    memory = memory.replace(
-        history=history, ttc_ticks=ttc_ticks, comfort_ticks=comfort_ticks
-    )
+    memory = memory.replace(history=history, ttc_ticks=ttc_ticks, comfort_ticks=comfort_ticks)
     return memory, soft
 
 
