@@ -11,7 +11,7 @@ import jax
 from carljax import leaderboard
 from carljax.leaderboard import Drive
 from carljax.ppo import beta, trainer
-from carljax.ppo.networks import ActorCritic
+from carljax.ppo.networks import ActorCritic, forward
 from carljax.sim.env import DrivingEnv
 from carljax.sim.types import Observation
 
@@ -27,7 +27,7 @@ def act(network: ActorCritic, params: Any, obs: Observation) -> jax.Array:
     Returns:
       (B, 2) float32 in [-1, 1].
     """
-    alpha, beta_, _ = network.apply(params, obs)
+    alpha, beta_, _ = forward(network, params, obs)
     return beta.to_command(beta.mean(alpha, beta_))
 
 
