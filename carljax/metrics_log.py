@@ -129,6 +129,11 @@ class WindowMean:
         return sum(self._values) / len(self._values) if self._values else math.nan
 
 
+def _shown(value: float, form: str) -> str:
+    """A number for people; a dash where there is none yet."""
+    return format(value, form) if math.isfinite(value) else "-"
+
+
 class Report:
     """Shows how training goes: a bar on a terminal, a line now and then elsewhere.
 
@@ -169,8 +174,8 @@ class Report:
         """
         text = (
             f"reward {metrics['rollout/reward']:.3f}"
-            f"  route {metrics['episode/route_completion']:.1f} %"
-            f"  {metrics.get('time/env_steps_per_s', math.nan):,.0f} samples/s"
+            f"  route {_shown(metrics['episode/route_completion'], '.1f')} %"
+            f"  {_shown(metrics.get('time/env_steps_per_s', math.nan), ',.0f')} samples/s"
         )
         self._bar.update(self._task, completed=update, description=text)
         now = time.monotonic()
