@@ -75,14 +75,27 @@ def all_movers(
     ego_length: jax.Array,
     ego_place: EgoPlace,
     road_map: RoadMap,
+    light_time: jax.Array,
 ) -> Mover:
-    """Lists what drivers see of one another: the agents and, last, the ego."""
+    """Lists what drivers see of one another: the agents and, last, the ego.
+
+    Nobody waits for an ego that a red light keeps from entering, unless it is too fast to stop.
+    """
     lane = planned_lane(agents, 0)
     valid = agents.valid
     half = 0.5 * agents.length
     ego_half = 0.5 * ego_length
     ego_left = road_map.lane_length[jnp.maximum(ego_place.lane, 0)] - ego_place.s
     held = must_stop(agents, stop)
+    ego_stop = _next_line(
+        jnp.maximum(ego_place.lane, 0),
+        ego_place.next_lane,
+        ego_place.s + ego_half,
+        road_map,
+        light_time,
+    )
+    room = ego_stop.distance > ego.speed**2 / (2 * BRAKING)
+    ego_held = (ego_stop.kind == STOP_LIGHT) & (ego_stop.light != LIGHT_GREEN) & room
 
     def with_ego(values: jax.Array, of_ego: jax.Array) -> jax.Array:
         return jnp.append(values, of_ego.astype(values.dtype))
@@ -94,21 +107,28 @@ def all_movers(
         entry=with_ego(road_map.lane_length[lane] - agents.lane_s - half, ego_left - ego_half),
         speed=with_ego(agents.speed, ego.speed),
         half_length=with_ego(half, ego_half),
-        can_go=with_ego(~held, jnp.ones((), bool)),
+        can_go=with_ego(~held, ~ego_held),
     )
 
 
 def stop_ahead(agents: Agents, road_map: RoadMap, light_time: jax.Array) -> StopAhead:
     """The stop line on the lane an agent is on or on the one it will take next."""
-    lane, following = planned_lane(agents, 0), planned_lane(agents, 1)
     front = agents.lane_s + 0.5 * agents.length
+    return _next_line(planned_lane(agents, 0), agents.lanes[:, 1], front, road_map, light_time)
+
+
+def _next_line(
+    lane: jax.Array, next_lane: jax.Array, front: jax.Array, road_map: RoadMap, time: jax.Array
+) -> StopAhead:
+    """The stop line ahead of a front bumper at arc length `front`; next_lane may be -1."""
+    following = jnp.where(next_lane >= 0, next_lane, lane)
     here = road_map.lane_stop_s[lane] - front
     there = road_map.lane_length[lane] + road_map.lane_stop_s[following] - front
     ahead = (road_map.lane_stop_kind[lane] > 0) & (here > -0.5)
-    kind_there = jnp.where(agents.lanes[:, 1] >= 0, road_map.lane_stop_kind[following], 0)
+    kind_there = jnp.where(next_lane >= 0, road_map.lane_stop_kind[following], 0)
     governing = jnp.where(ahead, lane, following)
     light = jnp.maximum(road_map.lane_light[governing], 0)
-    colour = lights.state(light_time, road_map.light_start[light], road_map.light_cycle[light])
+    colour = lights.state(time, road_map.light_start[light], road_map.light_cycle[light])
     return StopAhead(
         distance=jnp.where(ahead, here, there),
         kind=jnp.where(ahead, road_map.lane_stop_kind[lane], kind_there),
@@ -117,25 +137,35 @@ def stop_ahead(agents: Agents, road_map: RoadMap, light_time: jax.Array) -> Stop
 
 
 def must_stop(agents: Agents, stop: StopAhead) -> jax.Array:
-    """(N,) bool: a red light, a yellow one with room to stop, or a stop sign not yet honoured."""
+    """(N,) bool: a red light, a yellow one with room to stop, or a stop sign not yet honoured.
+
+    Whoever waited through the green for a gap goes at yellow: else a turn across a stream of
+    oncoming traffic is never made.
+    """
     room = stop.distance > agents.speed**2 / (2 * BRAKING)
-    not_green = (stop.light == LIGHT_RED) | ((stop.light != LIGHT_GREEN) & room)
-    red = (stop.kind == STOP_LIGHT) & not_green
+    stops_at_yellow = (stop.light != LIGHT_GREEN) & room & ~agents.has_stopped
+    red = (stop.kind == STOP_LIGHT) & ((stop.light == LIGHT_RED) | stops_at_yellow)
     sign = (stop.kind == STOP_SIGN) & ~agents.has_stopped
     return (red | sign) & (stop.distance > -0.5)
 
 
 def has_stopped(agents: Agents, stop: StopAhead, speed: jax.Array) -> jax.Array:
-    """(N,) bool: halted at the sign ahead; forgotten once the line is passed."""
-    near = (stop.kind == STOP_SIGN) & (stop.distance < 4.0)
-    return near & (agents.has_stopped | (speed < 0.2))
+    """(N,) bool: halted at the sign, or at the green light, ahead.
+
+    Forgotten once the line is passed, and when the light turns red.
+    """
+    halts = speed < 0.2
+    at_sign = (stop.kind == STOP_SIGN) & (agents.has_stopped | halts)
+    waits = halts & (stop.light == LIGHT_GREEN)
+    at_light = (stop.kind == STOP_LIGHT) & (agents.has_stopped | waits)
+    return (at_sign | (at_light & (stop.light != LIGHT_RED))) & (stop.distance < 4.0)
 
 
 def gated(agents: Agents, movers: Mover, road_map: RoadMap) -> jax.Array:
     """(N,) bool: others go first into the junction that an agent is about to enter.
 
-    Nobody enters while a conflicting lane is occupied. Whoever has priority and is near goes first;
-    among equals, whoever arrives first.
+    Nobody enters while a conflicting lane is occupied or while another car's front is on its way
+    into it. Whoever has priority and is near goes first; among equals, whoever arrives first.
     """
     following = planned_lane(agents, 1)
     entry = movers.entry[:-1]
@@ -144,13 +174,15 @@ def gated(agents: Agents, movers: Mover, road_map: RoadMap) -> jax.Array:
     owes_inside = _owes(following, movers.lane, road_map)
     owes = _owes(following, movers.next_lane, road_map)
     arrival = jnp.maximum(movers.entry, 0.0) / jnp.maximum(movers.speed, 2.0)
-    coming = movers.can_go & (arrival < GAP_TIME) & (movers.entry > -1.0)
+    coming = movers.can_go & (arrival < GAP_TIME)
+    entering = (movers.entry <= -1.0)[None, :]  # its centre, and so its lane, will follow
     order = jnp.arange(movers.lane.shape[0])
     mine, mine_order = arrival[:-1, None], order[:-1, None]
     earlier = (arrival[None, :] < mine) | ((arrival[None, :] == mine) & (order < mine_order))
     # Two that wait for one another would wait for ever.
     stuck = (agents.wait_s > PATIENCE)[:, None] & (movers.speed < 0.5)[None, :]
     waits = (owes == CONFLICT_YIELD) | ((owes == CONFLICT) & earlier)
+    waits |= (owes != FREE) & entering
     waits &= coming[None, :] & ~stuck
     return enters & ((owes_inside != FREE) | waits).any(axis=1)
 

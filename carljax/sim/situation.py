@@ -105,6 +105,8 @@ def ego_place(ego: EgoState, road_map: RoadMap, stretch: Route, stretch_idx: jax
     offset = geometry.to_frame(ego.xy, stretch.xy[stretch_idx], stretch.yaw[stretch_idx])
     lane = jnp.where(on_route, stretch.lane[stretch_idx], nearest.lane)
     s = jnp.where(on_route, stretch.lane_s[stretch_idx] + offset[0], nearest.s)
-    ahead = jnp.minimum(stretch_idx + JUNCTION_LOOK_AHEAD, stretch.num_points - 1)
-    coming = stretch.lane[ahead]
-    return EgoPlace(lane=lane, next_lane=jnp.where(on_route & (coming != lane), coming, -1), s=s)
+    ahead = stretch_idx + jnp.arange(JUNCTION_LOOK_AHEAD + 1)
+    coming = stretch.lane[jnp.minimum(ahead, stretch.num_points - 1)]
+    other = coming != lane
+    next_lane = jnp.where(on_route & other.any(), coming[jnp.argmax(other)], -1)
+    return EgoPlace(lane=lane, next_lane=next_lane, s=s)

@@ -63,7 +63,7 @@ def step(
       The agents dt later.
     """
     stop = stop_ahead(agents, road_map, light_time)
-    movers = all_movers(agents, stop, ego, ego_length, ego_place, road_map)
+    movers = all_movers(agents, stop, ego, ego_length, ego_place, road_map, light_time)
     accel = accelerations(agents, stop, movers, ego, ego_length, road_map, params)
     speed = jnp.maximum(agents.speed + accel * dt, 0.0)
     travelled = 0.5 * (agents.speed + speed) * dt

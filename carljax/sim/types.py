@@ -66,7 +66,7 @@ class Agents(struct.PyTreeNode):
       lanes: (N, 3) int32, the lane it is on and the two it will take next; -1 past a dead end.
       lane_s: (N,) m, arc length on lanes[:, 0].
       desired_speed_frac: (N,) this driver's free speed as a fraction of the limit.
-      has_stopped: (N,) bool, has come to rest at the stop sign ahead.
+      has_stopped: (N,) bool, has come to rest at the stop sign, or at the green light, ahead.
       wait_s: (N,) s, time at rest.
     """
 
