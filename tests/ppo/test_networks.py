@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import fill
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from carljax.ppo.config import NetworkConfig
-from carljax.ppo.networks import CONV_LAYERS, ActorCritic, conv_fit
+from carljax.ppo.networks import CONV_LAYERS, ActorCritic, ConvEncoder, Linear, conv_fit
 from carljax.sim.types import Observation
 
 
@@ -54,8 +55,7 @@ def test_parameter_count_is_the_papers(config, obs, expected):
 def test_any_image_size_works(encoder, size):
     network = ActorCritic(NetworkConfig(encoder=encoder))
     obs = _obs(3, size)
-    params = jax.jit(network.init)(jax.random.key(0), obs)
-    alpha, beta, value = jax.jit(network.apply)(params, obs)
+    alpha, beta, value = jax.jit(network.apply)(fill.params(network, obs), obs)
     assert alpha.shape == beta.shape == (3, 2)
     assert value.shape == (3,)
     assert np.all(np.asarray(alpha) > 1.0)
@@ -85,15 +85,15 @@ def test_small_images_keep_four_cells():
 
 
 def test_initialisation_is_the_papers():
-    network = ActorCritic(NetworkConfig())
-    params = jax.jit(network.init)(jax.random.key(0), _obs(1, 32))["params"]
-    np.testing.assert_array_equal(params["encoder"]["bias_3"], np.full(32, 0.1, np.float32))
-    # Xavier uniform, gain sqrt(2): bound sqrt(2) sqrt(6 / (fan_in + fan_out)); 25 taps, 24 -> 32.
-    bound = np.sqrt(2.0 * 6.0 / (25 * 24 + 25 * 32))
-    largest = np.max(np.abs(params["encoder"]["kernel_3"]))
+    encoder = ConvEncoder(NetworkConfig(encoder="roach", layer_norm=False))
+    params = jax.jit(encoder.init)(jax.random.key(0), _obs(1, 16).raster)["params"]
+    np.testing.assert_array_equal(params["bias_3"], np.full(64, 0.1, np.float32))
+    # Xavier uniform, gain sqrt(2): bound sqrt(2) sqrt(6 / (fan_in + fan_out)); 9 taps, 32 -> 64.
+    bound = np.sqrt(2.0 * 6.0 / (9 * 32 + 9 * 64))
+    largest = np.max(np.abs(params["kernel_3"]))
     assert 0.99 * bound < largest <= bound
     # PyTorch's linear layer: both within 1 / sqrt(256).
-    layer = params["policy_mlp"]["Linear_0"]
+    layer = Linear(128).init(jax.random.key(0), jnp.zeros((1, 256), jnp.float32))["params"]
     for name in ("kernel", "bias"):
         assert 0.9 / 16.0 < np.max(np.abs(layer[name])) <= 1.0 / 16.0
 
@@ -104,7 +104,7 @@ def test_encoder_equals_a_numpy_one(encoder):
     config = NetworkConfig(encoder=encoder, patch_size=4, patch_features=(3, 5))
     network = ActorCritic(config)
     obs = _obs(2, 20, channels=2)
-    variables = jax.jit(network.init)(jax.random.key(0), obs)
+    variables = fill.params(network, obs)
     _, state = network.apply(variables, obs, capture_intermediates=True)
     actual = state["intermediates"]["encoder"]["__call__"][0]
     params = jax.tree.map(np.float64, variables["params"]["encoder"])
@@ -137,7 +137,7 @@ def test_encoder_equals_a_numpy_one(encoder):
 def test_only_the_critic_sees_the_value_scalars():
     network = ActorCritic(NetworkConfig(encoder="patch"))
     obs = _obs(2, 16)
-    params = network.init(jax.random.key(0), obs)
+    params = fill.params(network, obs)
     other = obs.replace(value_scalars=obs.value_scalars + 1.0)
     alpha, beta, value = network.apply(params, obs)
     alpha_2, beta_2, value_2 = network.apply(params, other)
@@ -153,6 +153,6 @@ def test_beta_min_bounds_alpha_and_beta():
     outputs = []
     for beta_min in (0.0, 1.0):
         network = ActorCritic(NetworkConfig(encoder="patch", beta_min=beta_min))
-        outputs.append(network.apply(network.init(jax.random.key(0), obs), obs))
+        outputs.append(network.apply(fill.params(network, obs), obs))
     for lower, higher in zip(outputs[0][:2], outputs[1][:2], strict=True):
         np.testing.assert_allclose(higher - lower, 1.0, atol=1e-6)

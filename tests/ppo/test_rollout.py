@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fill
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -13,7 +14,7 @@ from carljax.ppo.config import NetworkConfig
 from carljax.ppo.networks import ActorCritic
 from carljax.ppo.rollout import mean_metrics, rollout
 
-NUM_ENVS, NUM_STEPS = 6, 40
+NUM_ENVS, NUM_STEPS = 6, 60
 NETWORK = ActorCritic(
     NetworkConfig(encoder="patch", hidden_size=8, joint_size=8, patch_features=(4, 4))
 )
@@ -26,11 +27,11 @@ def _run(env, params, env_state, keys):
 
 @pytest.fixture(scope="module")
 def recorded():
-    env = toy_env.ToyEnv(starts=jnp.linspace(-0.8, 0.8, 9, dtype=jnp.float32), limit=7)
+    env = toy_env.ToyEnv(starts=jnp.linspace(-0.8, 0.8, 9, dtype=jnp.float32), limit=9)
     env_state = jax.vmap(lambda key: env.observe(env.start(key)))(
         jax.random.split(jax.random.key(0), NUM_ENVS)
     )
-    params = NETWORK.init(jax.random.key(1), env_state.obs)
+    params = fill.params(NETWORK, env_state.obs)
     keys = jax.random.split(jax.random.key(2), NUM_ENVS)
     return env, params, env_state, keys, _run(env, params, env_state, keys)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 
+import fill
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -50,7 +51,7 @@ def _samples(num=NUM, size=16):
 @functools.cache
 def _params(network=NETWORK, size=16):
     obs = jax.tree.map(lambda x: x[:1], _samples(4, size).obs)
-    return jax.jit(network.init)(jax.random.key(0), obs)
+    return fill.params(network, obs)
 
 
 def _on_devices(function, num_devices, out_specs=REPLICATED):
@@ -79,8 +80,8 @@ def _gradient(config, num_devices):
 
 @pytest.mark.parametrize(
     ("num_devices", "micro_batch_size"),
-    [(4, None), (1, 8), (4, 2)],
-    ids=["4 devices", "micro-batches", "4 devices, micro-batches"],
+    [(4, None), (4, 2)],
+    ids=["4 devices", "4 devices, micro-batches"],
 )
 def test_gradient_and_metrics_are_those_of_the_whole_minibatch(num_devices, micro_batch_size):
     whole = _gradient(PPOConfig(), 1)
@@ -140,16 +141,16 @@ def _update(config, network=NETWORK, size=16):
 
 def test_one_step_is_clipped_adam():
     """First step of Adam: both moments are bias-corrected to g and g^2, so -lr g / (|g| + eps)."""
-    config = PPOConfig(update_epochs=1, num_minibatches=1, max_grad_norm=0.2)
+    config = PPOConfig(update_epochs=1, num_minibatches=1, max_grad_norm=0.05)
     grads, _ = _gradient(PPOConfig(), 1)
     flat = np.concatenate([np.float64(g).ravel() for g in jax.tree.leaves(grads)])
     norm = np.sqrt(np.sum(flat**2))
-    assert norm > 0.4  # clipping does something
+    assert norm > 0.1  # clipping does something
     params, _, metrics = _update(config)(_samples())
     np.testing.assert_allclose(metrics["grad_norm"], norm, rtol=1e-4)
 
     def check(before, after, grad):
-        clipped = np.float64(grad) * 0.2 / norm
+        clipped = np.float64(grad) * 0.05 / norm
         expected = np.float64(before) - 0.01 * clipped / (np.abs(clipped) + 1e-5)
         np.testing.assert_allclose(after, expected, atol=2e-5)
 
@@ -183,7 +184,9 @@ def test_learning_rate_falls_linearly_to_zero():
 
 def test_compiled_update_has_no_slow_convolution():
     """In a loop `f01b_i01o` is 22 to 75 times slower; `__ynn_fusion` runs on one thread."""
-    network = ActorCritic(NetworkConfig(encoder="roach", hidden_size=8, joint_size=8))
+    network = ActorCritic(
+        NetworkConfig(encoder="roach", layer_norm=False, hidden_size=8, joint_size=8)
+    )
     config = PPOConfig(update_epochs=2, num_minibatches=2, micro_batch_size=8)
     lowered = _update(config, network, 32).lower(_samples(size=32))
     text = lowered.compile(compiler_options=trainer.compiler_options("cpu")).as_text()
