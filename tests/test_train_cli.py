@@ -27,7 +27,7 @@ TINY = [
     *("--env.num-agents", "4", "--env.raster.height", "16", "--env.raster.width", "16"),
     *("--env.raster.ego-from-bottom-px", "4", "--network.hidden-size", "16"),
     *("--network.joint-size", "16", "--ppo.num-envs", "4", "--ppo.num-steps", "4"),
-    *("--ppo.num-minibatches", "2", "--ppo.micro-batch-size", "None"),
+    *("--ppo.gamma", "0.99", "--ppo.num-minibatches", "2", "--ppo.micro-batch-size", "None"),
     *("--ppo.total-samples", str(NUM_UPDATES * 16), "--run.checkpoint-every", "1"),
 ]
 
