@@ -17,6 +17,7 @@ from carljax.render import image
 from carljax.reward.reward import SOFT_FACTORS
 from carljax.sim import lights
 from carljax.sim.env import DrivingEnv
+from carljax.sim.rasterizer import RasterConfig
 from carljax.sim.road_map import PIXELS_PER_METRE
 from carljax.sim.types import (
     KIND_PEDESTRIAN,
@@ -110,12 +111,18 @@ def frame(env: DrivingEnv, world: World, state: State, command: np.ndarray) -> I
     width = 2 * PANEL + 3 * MARGIN
     canvas = Image.new("RGB", (width, PANEL + TEXT_HEIGHT + 2 * MARGIN), BACKGROUND)
     canvas.paste(map_view(world, state), (MARGIN, MARGIN))
-    seen = Image.fromarray(image.bev_image(np.asarray(state.obs.raster), env.config.raster))
-    canvas.paste(
-        seen.resize((PANEL, PANEL), Image.Resampling.NEAREST), (PANEL + 2 * MARGIN, MARGIN)
-    )
+    seen = policy_view(np.asarray(state.obs.raster), env.config.raster)
+    canvas.paste(seen, (PANEL + 2 * MARGIN + (PANEL - seen.width) // 2, MARGIN))
     _draw_numbers(ImageDraw.Draw(canvas), state, command, PANEL + 2 * MARGIN)
     return canvas
+
+
+def policy_view(raster: np.ndarray, config: RasterConfig) -> Image.Image:
+    """Colours the policy's image, as large as the panel allows without distorting it."""
+    scale = PANEL / max(raster.shape[:2])
+    picture = image.bev_image(raster, config, scale=max(1, int(scale)))
+    size = (round(raster.shape[1] * scale), round(raster.shape[0] * scale))
+    return Image.fromarray(picture).resize(size, Image.Resampling.NEAREST)
 
 
 def map_view(world: World, state: State) -> Image.Image:
