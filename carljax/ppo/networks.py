@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from flax import linen as nn
 
 from carljax.ppo.config import NetworkConfig
-from carljax.ppo.conv import conv, patch_conv
+from carljax.ppo.conv import conv, matmul, patch_conv
 from carljax.sim.types import Observation
 
 # Channels, kernel, stride of each convolution. source: CaRL paper, "Architecture" (and Roach's).
@@ -88,7 +88,7 @@ class Linear(nn.Module):
             return jax.random.uniform(key, shape, minval=-bound, maxval=bound)
 
         kernel = self.param("kernel", init, (x.shape[-1], self.features))
-        return x @ kernel + self.param("bias", init, (self.features,))
+        return matmul(x, kernel) + self.param("bias", init, (self.features,))
 
 
 class Mlp(nn.Module):

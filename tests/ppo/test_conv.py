@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from carljax.ppo.conv import conv, patch_conv
+from carljax.ppo.conv import conv, matmul, patch_conv
 
 
 def _plain(x, w, stride):
@@ -60,6 +60,15 @@ def test_patch_conv_equals_the_plain_one(dtype):
     jax.tree.map(
         lambda a, b: np.testing.assert_allclose(a, b, atol=1e-4), grad(patch_conv), grad(_plain)
     )
+
+
+def test_matmul_equals_the_plain_one():
+    x, w = _data((6, 5), (5, 7))
+    total = lambda f: lambda x, w: jnp.sum(jnp.sin(f(x, w)))  # noqa: E731
+    ours, plain = (
+        jax.jit(jax.value_and_grad(total(f), argnums=(0, 1)))(x, w) for f in (matmul, jnp.matmul)
+    )
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-5), ours, plain)
 
 
 @pytest.mark.parametrize("function", [conv, patch_conv])
