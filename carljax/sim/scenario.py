@@ -26,6 +26,9 @@ EGO_CLEARANCE = 18.0  # m kept free around the start
 ROUTE_SLACK = 8  # route points beyond one per metre
 
 
+_initial = jax.jit(jax.vmap(traffic.initial, in_axes=(0, 0, 0, None, 0)))
+
+
 class ScenarioBank(struct.PyTreeNode):
     """All that stays the same while training: held once per device.
 
@@ -85,11 +88,10 @@ def make_bank(
     lane, s, speed = (np.stack(values) for values in zip(*agents, strict=True))
     road_map = road_map_builder.build(towns)
     keys = jax.random.split(jax.random.key(seed), num_scenarios)
-    initial = jax.jit(jax.vmap(traffic.initial, in_axes=(0, 0, 0, None, 0)))
     return ScenarioBank(
         road_map=road_map,
         routes=jax.tree.map(lambda *x: jnp.asarray(np.stack(x)), *routes),
-        agents=initial(
+        agents=_initial(
             jnp.asarray(lane, jnp.int32),
             jnp.asarray(s, jnp.float32),
             jnp.asarray(speed, jnp.float32),

@@ -44,3 +44,10 @@ def empty_env(small_env):
     agents = small_env.bank.agents
     nobody = agents.replace(kind=jax.numpy.zeros_like(agents.kind))
     return small_env.replace(bank=small_env.bank.replace(agents=nobody))
+
+
+@pytest.fixture(scope="session")
+def reset(small_env):
+    """The small environment's reset by seed, compiled once."""
+    one = jax.jit(lambda env, key: env.reset(key))
+    return lambda seed: one(small_env, jax.random.key(seed))
