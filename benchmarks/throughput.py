@@ -36,7 +36,7 @@ from carljax.sim.town import Town
 from carljax.sim.types import State
 
 SIM_ENVS, SIM_AGENTS, SIM_STEPS = 64, 32, 50
-RENDER_ENVS, RENDER_AGENTS = 64, 50
+RENDER_ENVS, RENDER_AGENTS, RENDER_STEPS = 32, 50, 20
 
 Kind = Literal["sim", "render", "rollout", "update", "end_to_end"]
 
@@ -111,16 +111,28 @@ def sim(command: Command, config: TrainConfig, towns: list[Town]) -> dict[str, A
 def render(
     command: Command, config: TrainConfig, towns: list[Town], raster: RasterConfig
 ) -> dict[str, Any]:
-    """Observations of moments some steps into episodes, nothing moving."""
+    """Observations one after the other, as in a rollout; only the ego turns a little."""
     env = small_env(command, config, towns, RENDER_AGENTS, raster)
     scenarios = jnp.arange(RENDER_ENVS) % env.bank.num_scenarios
     state = jax.jit(drive.start)(env, scenarios, jax.random.key(0)).state
-    observe = jit(jax.vmap(DrivingEnv.observe, in_axes=(None, 0)))
-    seconds = timed(observe, lambda _: (env, state.replace(obs=None)), command.repeats)
+
+    def turn(state: State) -> State:
+        sim = state.pipeline_state
+        ego = sim.ego.replace(yaw=sim.ego.yaw + jnp.float32(0.01))
+        return state.replace(pipeline_state=sim.replace(ego=ego))
+
+    def frames(env: DrivingEnv, state: State) -> State:
+        def frame(state: State, _: None) -> tuple[State, None]:
+            return jax.vmap(lambda one: env.observe(turn(one)))(state), None
+
+        return jax.lax.scan(frame, state, None, length=RENDER_STEPS)[0]
+
+    seconds = timed(jit(frames), lambda _: (env, state), command.repeats)
     return {
         "benchmark": "render",
-        "frames_per_s": RENDER_ENVS / seconds,
+        "frames_per_s": RENDER_ENVS * RENDER_STEPS / seconds,
         "num_envs": RENDER_ENVS,
+        "num_steps": RENDER_STEPS,
         "num_agents": RENDER_AGENTS,
         "shape": list(state.obs.raster.shape[1:]),
     }

@@ -91,6 +91,8 @@ _CODE_VEHICLE, _CODE_BRAKE, _CODE_STATIC, _CODE_PEDESTRIAN = 1, 130, 131, 132
 _SAMPLE_STEP = 0.7  # px
 
 # No index here is negative, and saying so makes the gather over the atlas a fifth faster.
+# Leaves 15 bits before the point: 16 km of atlas.
+_FRACTION_BITS = 16
 _GATHER: dict[str, Any] = {"mode": "promise_in_bounds", "wrap_negative_indices": False}
 _SCATTER: dict[str, Any] = {"mode": "drop", "wrap_negative_indices": False}
 
@@ -241,24 +243,37 @@ def _static_at(
     down: float,
     right: float,
 ) -> jax.Array:
-    """(H, W) uint8: the atlas at each pixel's centre, or so many pixels down and right of it."""
+    """(H, W) uint8: the atlas at each pixel's centre, or so many pixels down and right of it.
+
+    Places are fixed-point numbers, `_FRACTION_BITS` behind the point: whole steps along rows and
+    columns are six times faster on a CPU than floats rounded at each pixel, and drift by less than
+    a hundredth of an atlas pixel over the image.
+    """
     _, rows, columns = road_map.layers.shape
     # Iota, not constants: with constants XLA's CPU code for this gather is eight times slower.
-    row = jnp.arange(config.height, dtype=jnp.float32)[:, None]
-    column = jnp.arange(config.width, dtype=jnp.float32)[None, :]
-    ahead = np.float32(config.height - config.ego_from_bottom_px - 0.5 - down) - row
-    left = np.float32(config.width / 2 - 0.5 - right) - column
+    row = jnp.arange(config.height, dtype=jnp.int32)[:, None]
+    column = jnp.arange(config.width, dtype=jnp.int32)[None, :]
+    ahead = np.float32(config.height - config.ego_from_bottom_px - 0.5 - down)
+    left = np.float32(config.width / 2 - 0.5 - right)
     scale = np.float32(PIXELS_PER_METRE / config.pixels_per_metre)
     cos, sin = jnp.cos(ego.yaw) * scale, jnp.sin(ego.yaw) * scale
-    # The half makes the floor below a rounding.
+    # Atlas pixel under the image's first one; the half makes the shift below a rounding.
     at = (ego.xy - road_map.origin[route.town]) * PIXELS_PER_METRE + 0.5
-    x = jnp.floor(at[0] + cos * ahead - sin * left).astype(jnp.int32)
-    y = jnp.floor(at[1] + sin * ahead + cos * left).astype(jnp.int32)
+    first = at + jnp.stack([cos * ahead - sin * left, sin * ahead + cos * left])
+    x_first, y_first = _fixed_point(first[0]), _fixed_point(first[1])
+    cos, sin = _fixed_point(cos), _fixed_point(sin)
+    x = (x_first - cos * row + sin * column) >> _FRACTION_BITS
+    y = (y_first - sin * row - cos * column) >> _FRACTION_BITS
     # Unsigned, a negative number is larger than any size.
     inside = (x.astype(jnp.uint32) < columns) & (y.astype(jnp.uint32) < rows)
     index = jnp.where(inside, (route.town * rows + y) * columns + x, 0)
     bits = road_map.layers.reshape(-1).at[index].get(**_GATHER)
     return jnp.where(inside, bits & jnp.uint8(_BIT_ROUTE - 1), jnp.uint8(0))
+
+
+def _fixed_point(number: jax.Array) -> jax.Array:
+    """int32 in units of 2 ** -_FRACTION_BITS."""
+    return jnp.round(number * (1 << _FRACTION_BITS)).astype(jnp.int32)
 
 
 def _route(

@@ -322,7 +322,6 @@ def test_random_scenes_match_the_oracle(world, config, seed):
         both = np.count_nonzero((ours == theirs) & (theirs > 0))
         either = np.count_nonzero(ours | theirs)
         least = 0.999 if channel in (ROAD, ROUTE, LINES, SHOULDER) else 0.9
-        print("R", channel, both, either)
         assert both >= least * either - 3, rasterizer.CHANNELS[channel]
     assert np.count_nonzero(expected.any(axis=(0, 1))) >= 8
 
