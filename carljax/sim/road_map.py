@@ -36,8 +36,8 @@ class RoadMap(struct.PyTreeNode):
       lane_in_junction: (K,) bool.
       lane_junction: (K,) int32, running index of its junction, -1 outside.
       lane_slot: (K,) int32, place among the lanes of its junction, 0 outside.
-      lane_conflict: (K, J) uint8 over the slots of the same junction: 0 none, CONFLICT,
-        CONFLICT_YIELD.
+      lane_conflict: (K, J) uint8 over the slots of the same junction: FREE or one
+        of the CONFLICT codes of `junctions`.
       lane_fork: (K,) int32, equal for lanes that leave the same lane.
       lane_stop_s: (K,) m, where its stop line lies.
       lane_stop_kind: (K,) int32, STOP_*.

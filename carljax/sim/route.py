@@ -8,12 +8,11 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-WINDOW_BACK = (
-    24  # points kept behind the ego: lights are drawn from 20 behind. source: carl-facts 2.1
-)
-WINDOW_AHEAD = 152  # points kept ahead: 150 are drawn. source: carl-facts 2.1
+# source: the authors' code draws lights from 20 points behind the ego to 150 ahead
+WINDOW_BACK = 24  # points kept behind the ego
+WINDOW_AHEAD = 152  # points kept ahead
 WINDOW = WINDOW_BACK + WINDOW_AHEAD
-LOOK_AHEAD = 6  # the current point and the next five. source: carl-facts 4.3, route deviation
+LOOK_AHEAD = 6  # the current point and the next five. source: the authors' code
 
 
 class Route(struct.PyTreeNode):
@@ -108,7 +107,7 @@ def advance(route: Route, route_idx: jax.Array, xy: jax.Array) -> jax.Array:
     """The last passed point after a move.
 
     A point is passed once the ego is ahead of it; only the next two are looked at, which credits at
-    most 2 m a step. source: carl-facts 4.2.
+    most 2 m a step. source: the authors' code.
 
     Args:
       route: a route or a window of one.

@@ -31,7 +31,6 @@ from carljax.sim.types import KIND_VEHICLE, Agents, EgoState
 FAR = 1e3  # m, a gap that changes nothing
 FORK_LENGTH = 9.0  # m in which lanes that part still overlap. source: ours, car length + width
 CURVE_BRAKING = 1.5  # m/s^2 towards a bend. source: ours
-MAX_BRAKING = 8.0  # m/s^2. source: carl-facts 13, full brake is 7 to 8
 STOP_MARGIN = 1.0  # m kept to a stop line. source: ours
 
 
@@ -108,7 +107,7 @@ def accelerations(
 
     accel = jnp.minimum(respond(gap, leader_speed), respond(ego_gap, ego.speed))
     accel = jnp.minimum(accel, respond(still, jnp.zeros_like(still)))
-    return jnp.where(agents.valid, jnp.clip(accel, -MAX_BRAKING, None), 0.0)
+    return jnp.where(agents.valid, accel, 0.0)
 
 
 def desired_speed(agents: Agents, road_map: RoadMap) -> jax.Array:
