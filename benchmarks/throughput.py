@@ -29,7 +29,7 @@ from carljax.ppo.networks import ActorCritic
 from carljax.ppo.rollout import rollout
 from carljax.ppo.types import Minibatch, TrainState
 from carljax.ppo.update import update
-from carljax.sim import scenario
+from carljax.sim import episodes
 from carljax.sim.env import DrivingEnv, make_env
 from carljax.sim.rasterizer import RasterConfig
 from carljax.sim.town import Town
@@ -113,8 +113,8 @@ def render(
 ) -> dict[str, Any]:
     """Observations one after the other, as in a rollout; only the ego turns a little."""
     env = small_env(command, config, towns, RENDER_AGENTS, raster)
-    scenarios = jnp.arange(RENDER_ENVS) % env.bank.num_scenarios
-    state = jax.jit(drive.start)(env, scenarios, jax.random.key(0)).state
+    episodes = jnp.arange(RENDER_ENVS) % env.bank.num_episodes
+    state = jax.jit(drive.start)(env, episodes, jax.random.key(0)).state
 
     def turn(state: State) -> State:
         sim = state.pipeline_state
@@ -201,7 +201,7 @@ def small_env(
 ) -> DrivingEnv:
     """An environment of all towns with another number of agents and image."""
     values = dataclasses.replace(config.env, num_agents=num_agents, raster=raster)
-    bank = scenario.make_bank(towns, command.num_routes, num_agents, 0, values.route_length)
+    bank = episodes.make_bank(towns, command.num_routes, values.population, 0, values.route_length)
     return make_env(bank, values, config.reward)
 
 

@@ -1,4 +1,4 @@
-"""From a configuration to what runs: towns, scenario banks, environment, network, devices."""
+"""From a configuration to what runs: towns, episode banks, environment, network, devices."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from carljax.ppo import trainer
 from carljax.ppo.networks import ActorCritic
 from carljax.ppo.rollout import rollout
 from carljax.ppo.types import TrainState
-from carljax.sim import scenario, town, towns
+from carljax.sim import episodes, town, towns
 from carljax.sim.env import DrivingEnv, make_env
 from carljax.sim.town import Town
 
@@ -85,8 +85,8 @@ def environment(
     Returns:
       The environment.
     """
-    bank = scenario.make_bank(
-        loaded, num_routes, config.env.num_agents, seed, config.env.route_length
+    bank = episodes.make_bank(
+        loaded, num_routes, config.env.population, seed, config.env.route_length
     )
     return make_env(bank, config.env, config.reward)
 

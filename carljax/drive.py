@@ -31,23 +31,23 @@ def act(network: ActorCritic, params: Any, obs: Observation) -> jax.Array:
     return beta.to_command(beta.mean(alpha, beta_))
 
 
-def start(env: DrivingEnv, scenarios: jax.Array, key: jax.Array) -> Drive:
-    """Puts the ego at the start of given scenarios.
+def start(env: DrivingEnv, episodes: jax.Array, key: jax.Array) -> Drive:
+    """Puts the ego at the start of given episodes.
 
     Args:
       env: the environment.
-      scenarios: (B,) int32, rows of its bank.
-      key: PRNG key of what the scenarios leave open; the same key and row give the same start.
+      episodes: (B,) int32, rows of its bank.
+      key: PRNG key of what the episodes leave open; the same key and row give the same start.
 
     Returns:
       (B,) drives.
     """
 
-    def one(scenario: jax.Array) -> Drive:
-        state = env.start_scenario(scenario, jax.random.fold_in(key, scenario))
+    def one(episode: jax.Array) -> Drive:
+        state = env.start_episode(episode, jax.random.fold_in(key, episode))
         return leaderboard.begin(env.observe(state))
 
-    return jax.vmap(one)(scenarios)
+    return jax.vmap(one)(episodes)
 
 
 def step(

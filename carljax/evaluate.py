@@ -92,8 +92,8 @@ def _drive_all(network: ActorCritic, env: DrivingEnv, params: Any) -> Drive:
     def again(run: Drive) -> Drive:
         return drive.step(network, env, params, run)[0]
 
-    scenarios = jnp.arange(env.bank.num_scenarios)
-    run = drive.start(env, scenarios, jax.random.key(TRAFFIC_SEED))
+    episodes = jnp.arange(env.bank.num_episodes)
+    run = drive.start(env, episodes, jax.random.key(TRAFFIC_SEED))
     run = jax.lax.while_loop(is_any_running, again, run)
     return run.replace(state=run.state.replace(pipeline_state=None, obs=None))
 

@@ -78,9 +78,9 @@ def one_by_one(env, params):
     network = ActorCritic(CONFIG.network)
 
     @jax.jit
-    def first(scenario):
-        key = jax.random.fold_in(jax.random.key(evaluate.TRAFFIC_SEED), scenario)
-        return env.observe(env.start_scenario(scenario, key))
+    def first(episode):
+        key = jax.random.fold_in(jax.random.key(evaluate.TRAFFIC_SEED), episode)
+        return env.observe(env.start_episode(episode, key))
 
     @jax.jit
     def step(state):

@@ -18,7 +18,7 @@ from carljax.reward.reward import SOFT_FACTORS
 from carljax.sim import lights
 from carljax.sim.env import DrivingEnv
 from carljax.sim.rasterizer import RasterConfig
-from carljax.sim.road_map import PIXELS_PER_METRE
+from carljax.sim.road_map import PIXELS_PER_METRE, RoadMap
 from carljax.sim.types import (
     KIND_PEDESTRIAN,
     KIND_STATIC,
@@ -28,6 +28,7 @@ from carljax.sim.types import (
     LIGHT_YELLOW,
     STOP_LIGHT,
     STOP_NONE,
+    LightClock,
     State,
 )
 
@@ -59,7 +60,7 @@ class World:
       route_xy: (R, 2) m.
       route_yaw: (R,) rad.
       stop_idx, stop_kind, stop_light, stop_width: (Q,) of the route's stop lines.
-      light_cycle, light_start: (L,) s.
+      road_map: all towns, on the device.
       ego_size: length and width, m.
     """
 
@@ -71,15 +72,14 @@ class World:
     stop_kind: np.ndarray
     stop_light: np.ndarray
     stop_width: np.ndarray
-    light_cycle: np.ndarray
-    light_start: np.ndarray
+    road_map: RoadMap
     ego_size: tuple[float, float]
 
 
-def read_world(env: DrivingEnv, scenario: int) -> World:
-    """Fetches the town and the route of a scenario from the device."""
+def read_world(env: DrivingEnv, episode_idx: int) -> World:
+    """Fetches the town and the route of an episode from the device."""
     routes, road_map = env.bank.routes, env.bank.road_map
-    route = jax.device_get(jax.tree.map(lambda x: x[scenario], routes))
+    route = jax.device_get(jax.tree.map(lambda x: x[episode_idx], routes))
     town = int(route.town)
     return World(
         layers=np.asarray(road_map.layers[town]),
@@ -90,8 +90,7 @@ def read_world(env: DrivingEnv, scenario: int) -> World:
         stop_kind=route.stop_kind,
         stop_light=route.stop_light,
         stop_width=route.stop_width,
-        light_cycle=np.asarray(road_map.light_cycle),
-        light_start=np.asarray(road_map.light_start),
+        road_map=road_map,
         ego_size=(float(env.vehicle.length), float(env.vehicle.width)),
     )
 
@@ -143,7 +142,7 @@ def map_view(world: World, state: State) -> Image.Image:
         draw.line(pixels(world.route_xy[ahead[0] : ahead[-1] + 1]), fill=AHEAD, width=3)
     for q in range(len(world.stop_kind)):
         if world.stop_kind[q] != STOP_NONE:
-            colour = _stop_colour(world, q, sim.light_time)
+            colour = _stop_colour(world, q, sim.lights)
             draw.line(pixels(_stop_line(world, q)), fill=colour, width=3)
     agents = sim.agents
     poses = np.column_stack([agents.xy, agents.yaw, agents.length, agents.width])
@@ -184,11 +183,10 @@ def _stop_line(world: World, q: int) -> np.ndarray:
     return world.route_xy[min(idx, len(world.route_xy) - 1)] + np.stack([across, -across])
 
 
-def _stop_colour(world: World, q: int, light_time: jax.Array) -> tuple[int, int, int]:
+def _stop_colour(world: World, q: int, clock: LightClock) -> tuple[int, int, int]:
     if world.stop_kind[q] != STOP_LIGHT:
         return STOP
-    light = int(world.stop_light[q])
-    colour = lights.state(light_time, world.light_start[light], world.light_cycle[light])
+    colour = lights.colour(world.stop_light[q], clock, world.road_map)
     return LIGHT_COLOURS[int(colour)]
 
 

@@ -24,7 +24,7 @@ NUM_COLOURS = 96
 
 
 def save(
-    path: Path, env: DrivingEnv, network: ActorCritic, params: Any, scenario: int, seed: int = 0
+    path: Path, env: DrivingEnv, network: ActorCritic, params: Any, episode_idx: int, seed: int = 0
 ) -> None:
     """Drives one route with the deterministic policy and writes it as an animated GIF.
 
@@ -33,13 +33,13 @@ def save(
       env: with the route.
       network: actor and critic.
       params: its variables.
-      scenario: row of the environment's bank.
+      episode_idx: row of the environment's bank.
       seed: of the traffic; 0 drives what `evaluate` drives.
     """
-    world = read_world(env, scenario)
+    world = read_world(env, episode_idx)
     frames = [
         frame(env, world, state, command)
-        for state, command in episode(env, network, params, scenario, seed)
+        for state, command in episode(env, network, params, episode_idx, seed)
     ]
     path.parent.mkdir(parents=True, exist_ok=True)
     palette = frames[len(frames) // 2].quantize(NUM_COLOURS)
@@ -50,7 +50,7 @@ def save(
 
 
 def episode(
-    env: DrivingEnv, network: ActorCritic, params: Any, scenario: int, seed: int = 0
+    env: DrivingEnv, network: ActorCritic, params: Any, episode_idx: int, seed: int = 0
 ) -> Iterator[tuple[State, np.ndarray]]:
     """Drives one route, giving every third state and the last.
 
@@ -58,7 +58,7 @@ def episode(
       env: with the route.
       network: actor and critic.
       params: its variables.
-      scenario: row of the environment's bank.
+      episode_idx: row of the environment's bank.
       seed: of the traffic.
 
     Yields:
@@ -66,7 +66,7 @@ def episode(
     """
     step = drive.compiled(drive.step, network)
     params = jax.device_get(params)
-    run = jax.jit(drive.start)(env, jnp.array([scenario]), jax.random.key(seed))
+    run = jax.jit(drive.start)(env, jnp.array([episode_idx]), jax.random.key(seed))
     for number in range(1, MAX_FRAMES * FRAME_EVERY + 1):
         run, command = step(env, params, run)
         state = run.state

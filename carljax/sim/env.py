@@ -15,14 +15,23 @@ from flax import struct
 
 from carljax.reward import reward
 from carljax.reward.config import RewardConfig
-from carljax.sim import bicycle, respawn, route, situation, spawn, traffic
+from carljax.sim import bicycle, lights, population, respawn, route, situation, spawn, traffic
 from carljax.sim.bicycle import VehicleParams
+from carljax.sim.episodes import EpisodeBank
 from carljax.sim.idm import IDMParams
 from carljax.sim.observation import observe
+from carljax.sim.population import Population
 from carljax.sim.rasterizer import RasterConfig
 from carljax.sim.route import Route
-from carljax.sim.scenario import ScenarioBank
-from carljax.sim.types import EgoState, RewardTerms, SimState, Situation, State
+from carljax.sim.scenarios import script
+from carljax.sim.types import (
+    EgoState,
+    LightClock,
+    RewardTerms,
+    SimState,
+    Situation,
+    State,
+)
 
 ACTION_SIZE = 2
 # m/s^2. source: ours, brisker than the textbook's city drivers: a queue clears in a green of 10 s.
@@ -37,11 +46,20 @@ class EnvConfig:
     dt: float = 0.1
     """Length of a step, s. source: paper, Engineering, 10 Hz"""
     num_agents: int = 32
-    """Most other cars around the ego at once."""
+    """Most vehicles of ordinary traffic around the ego at once."""
+    num_pedestrians: int = 12
+    """Most pedestrians around the ego at once."""
+    num_scenario_slots: int = 3
+    """Most scenarios in play at once."""
     route_length: float = 1000.0
     """Length of a route, m. source: paper, Scenario Generation"""
     raster: RasterConfig = dataclasses.field(default_factory=RasterConfig)
     """The bird's-eye view image."""
+
+    @property
+    def population(self) -> Population:
+        """Who has which rows of the agents."""
+        return Population(self.num_agents, self.num_scenario_slots, self.num_pedestrians)
 
 
 class DrivingEnv(struct.PyTreeNode):
@@ -55,7 +73,7 @@ class DrivingEnv(struct.PyTreeNode):
       config: sizes, static.
     """
 
-    bank: ScenarioBank
+    bank: EpisodeBank
     reward_config: RewardConfig
     vehicle: VehicleParams
     idm: IDMParams
@@ -67,7 +85,7 @@ class DrivingEnv(struct.PyTreeNode):
         return ACTION_SIZE
 
     def reset(self, key: jax.Array) -> State:
-        """Returns the first state of a scenario drawn from the bank."""
+        """Returns the first state of an episode drawn from the bank."""
         return self.observe(self.start(key))
 
     def step(self, state: State, action: jax.Array) -> State:
@@ -81,29 +99,32 @@ class DrivingEnv(struct.PyTreeNode):
 
     def start(self, key: jax.Array) -> State:
         """Returns what `reset` does, without the observation."""
-        key_scenario, key = jax.random.split(key)
-        scenario_idx = jax.random.randint(key_scenario, (), 0, self.bank.num_scenarios)
-        return self.start_scenario(scenario_idx, key)
+        key_episode, key = jax.random.split(key)
+        episode_idx = jax.random.randint(key_episode, (), 0, self.bank.num_episodes)
+        return self.start_episode(episode_idx, key)
 
-    def start_scenario(self, scenario_idx: jax.Array, key: jax.Array) -> State:
-        """Returns the first state of a given scenario, without the observation.
+    def start_episode(self, episode_idx: jax.Array, key: jax.Array) -> State:
+        """Returns the first state of a given episode, without the observation.
 
         Args:
-          scenario_idx: () int32, row of the bank.
-          key: PRNG key, of all that the scenario leaves open.
+          episode_idx: () int32, row of the bank.
+          key: PRNG key, of all that the bank leaves open.
         """
         key_light, key = jax.random.split(key)
         routes, zero_idx = self.bank.routes, jnp.zeros((), jnp.int32)
-        ego = _ego_at(
-            routes.xy[scenario_idx, 0], routes.z[scenario_idx], routes.yaw[scenario_idx, 0]
-        )
+        ego = _ego_at(routes.xy[episode_idx, 0], routes.z[episode_idx], routes.yaw[episode_idx, 0])
         sim = SimState(
             ego=ego,
-            agents=jax.tree.map(lambda x: x[scenario_idx], self.bank.agents),
+            agents=jax.tree.map(lambda x: x[episode_idx], self.bank.agents),
             reward_state=reward.init(ego, routes.stop_kind.shape[1]),
-            scenario_idx=scenario_idx.astype(jnp.int32),
+            episode_idx=episode_idx.astype(jnp.int32),
             route_idx=zero_idx,
-            light_time=jax.random.uniform(key_light, (), maxval=LIGHT_CLOCK),
+            walkers=jax.tree.map(lambda x: x[episode_idx], self.bank.walkers),
+            scenarios=script.empty_slots(self.config.num_scenario_slots),
+            lights=lights.clock(
+                jax.random.uniform(key_light, (), maxval=LIGHT_CLOCK),
+                self.config.num_scenario_slots,
+            ),
             step_count=zero_idx,
             key=key,
         )
@@ -122,25 +143,38 @@ class DrivingEnv(struct.PyTreeNode):
         before = state.pipeline_state
         key, key_traffic, key_respawn = jax.random.split(before.key, 3)
         dt, road_map = self.config.dt, self.bank.road_map
-        stretch, first = route.window(self.bank.routes, before.scenario_idx, before.route_idx)
+        stretch, first = route.window(self.bank.routes, before.episode_idx, before.route_idx)
         idx = before.route_idx - first
         ego = bicycle.step(before.ego, *bicycle.from_action(action), self.vehicle, dt)
         place = situation.ego_place(before.ego, road_map, stretch, idx)
-        agents = traffic.step(
-            before.agents,
+        rows = self.config.population
+        vehicles = population.rows(before.agents, rows.vehicles)
+        others = population.rows(before.agents, slice(rows.num_vehicles, None))
+        vehicles = traffic.step(
+            vehicles,
+            others,
             before.ego,
             jnp.float32(self.vehicle.length),
             place,
             road_map,
-            before.light_time,
+            before.lights,
             key_traffic,
             self.idm,
             dt,
         )
-        agents = respawn.respawn(agents, ego, stretch.town, road_map, key_respawn, spawn.CELL)
-        light_time = before.light_time + dt
+        traffic_rows = respawn.respawn(
+            population.rows(vehicles, rows.traffic),
+            ego,
+            stretch.town,
+            road_map,
+            key_respawn,
+            spawn.CELL,
+        )
+        cars = population.rows(vehicles, rows.cars)
+        agents = population.join(traffic_rows, cars, others)
+        clock = before.lights.replace(time=before.lights.time + dt)
         idx = route.advance(stretch, idx, ego.xy)
-        seen = self._situation(ego, stretch, first, idx, light_time)
+        seen = self._situation(ego, stretch, first, idx, clock)
         paid, terminated, memory, terms = reward.compute(
             before, ego, agents, seen, self.vehicle, self.reward_config, dt
         )
@@ -149,7 +183,7 @@ class DrivingEnv(struct.PyTreeNode):
             agents=agents,
             reward_state=memory,
             route_idx=seen.route_idx,
-            light_time=light_time,
+            lights=clock,
             step_count=before.step_count + 1,
             key=key,
         )
@@ -176,7 +210,7 @@ class DrivingEnv(struct.PyTreeNode):
         stretch: Route,
         first: jax.Array,
         idx: jax.Array,
-        light_time: jax.Array,
+        clock: LightClock,
     ) -> Situation:
         return situation.situation(
             ego,
@@ -185,11 +219,11 @@ class DrivingEnv(struct.PyTreeNode):
             stretch,
             first,
             idx,
-            light_time,
+            clock,
         )
 
 
-def make_env(bank: ScenarioBank, config: EnvConfig, reward_config: RewardConfig) -> DrivingEnv:
+def make_env(bank: EpisodeBank, config: EnvConfig, reward_config: RewardConfig) -> DrivingEnv:
     """Puts an environment together: CARLA's saloon as the ego among IDM's city drivers."""
     return DrivingEnv(
         bank=bank,

@@ -36,7 +36,7 @@ def build(network: RoadNetwork, table: LaneTable) -> JunctionTable:
     part.
     """
     num_lanes = len(table.length)
-    ids = {name: i for i, name in enumerate(sorted({j for j in table.junction if j is not None}))}
+    ids = junction_ids(table)
     junction = np.array([-1 if name is None else ids[name] for name in table.junction])
     fork = _forks(table)
     slot = np.zeros(num_lanes, int)
@@ -52,6 +52,11 @@ def build(network: RoadNetwork, table: LaneTable) -> JunctionTable:
                 if a != b and fork[a] != fork[b] and _meet(table, a, b):
                     conflict[a, slot[b]] = _owes(network, table, a, b, priority)
     return JunctionTable(junction, slot, conflict, fork)
+
+
+def junction_ids(table: LaneTable) -> dict[str, int]:
+    """Running index of each junction that has driving lanes, by its id in the file."""
+    return {name: i for i, name in enumerate(sorted({j for j in table.junction if j is not None}))}
 
 
 def _forks(table: LaneTable) -> np.ndarray:

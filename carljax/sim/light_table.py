@@ -7,6 +7,7 @@ import dataclasses
 import numpy as np
 
 from carljax.sim import lights
+from carljax.sim.junctions import junction_ids
 from carljax.sim.lane_table import LaneTable
 from carljax.sim.road_network import RoadNetwork
 from carljax.sim.types import STOP_LIGHT
@@ -16,11 +17,12 @@ JUNCTION_REACH = 60.0  # m beyond a light's lane in which its junction is looked
 
 @dataclasses.dataclass(frozen=True)
 class LightTable:
-    """Fields as in `RoadMap`: lane_light (K,), cycle (L,), start (L,)."""
+    """Fields as in `RoadMap`: lane_light (K,), cycle (L,), start (L,), junction (L,)."""
 
     lane_light: np.ndarray
     cycle: np.ndarray
     start: np.ndarray
+    junction: np.ndarray
 
 
 def build(network: RoadNetwork, table: LaneTable) -> LightTable:
@@ -40,6 +42,8 @@ def build(network: RoadNetwork, table: LaneTable) -> LightTable:
     lane_light = np.full(len(table.length), -1)
     cycle: list[float] = []
     start: list[float] = []
+    junction: list[int] = []
+    ids = junction_ids(table)
     for number, name in enumerate(sorted(groups)):
         order = sorted(groups[name], key=lambda g: _sequence(network, name, g))
         period = lights.SLOT_S * max(2, len(order))
@@ -48,10 +52,11 @@ def build(network: RoadNetwork, table: LaneTable) -> LightTable:
         for place, group in enumerate(order):
             lane_light[groups[name][group]] = len(cycle)
             cycle.append(period)
+            junction.append(ids.get(name, -1))
             start.append((place * lights.SLOT_S + offset) % period)
     if not cycle:  # the table is never empty, so that look-ups need no special case
-        cycle, start = [lights.SLOT_S], [0.0]
-    return LightTable(lane_light, np.array(cycle), np.array(start))
+        cycle, start, junction = [lights.SLOT_S], [0.0], [-1]
+    return LightTable(lane_light, np.array(cycle), np.array(start), np.array(junction))
 
 
 def _junction_of(table: LaneTable, lane: int) -> str:

@@ -34,7 +34,7 @@ def observe(env: DrivingEnv, sim: SimState) -> Observation:
       The observation.
     """
     road_map = env.bank.road_map
-    stretch, first = route.window(env.bank.routes, sim.scenario_idx, sim.route_idx)
+    stretch, first = route.window(env.bank.routes, sim.episode_idx, sim.route_idx)
     idx = sim.route_idx - first
     memory, config = sim.reward_state, env.reward_config
     raster = rasterizer.render(
@@ -43,8 +43,8 @@ def observe(env: DrivingEnv, sim: SimState) -> Observation:
         road_map,
         stretch,
         idx,
-        situation.stop_lights(road_map, stretch, sim.light_time),
-        situation.yellow_left(road_map, stretch, sim.light_time),
+        situation.stop_lights(road_map, stretch, sim.lights),
+        situation.yellow_left(road_map, stretch, sim.lights),
         memory.stop_satisfied,
         env.config.raster,
     )

@@ -9,7 +9,15 @@ from flax import struct
 from carljax.sim import lights
 from carljax.sim.junctions import CONFLICT, CONFLICT_YIELD, FREE
 from carljax.sim.road_map import RoadMap
-from carljax.sim.types import LIGHT_GREEN, LIGHT_RED, STOP_LIGHT, STOP_SIGN, Agents, EgoState
+from carljax.sim.types import (
+    LIGHT_GREEN,
+    LIGHT_RED,
+    STOP_LIGHT,
+    STOP_SIGN,
+    Agents,
+    EgoState,
+    LightClock,
+)
 
 BRAKING = 3.0  # m/s^2 at which a driver still stops for yellow. source: ours, a firm stop
 GATE_RANGE = 40.0  # m before a junction at which others are looked at. source: ours
@@ -75,7 +83,7 @@ def all_movers(
     ego_length: jax.Array,
     ego_place: EgoPlace,
     road_map: RoadMap,
-    light_time: jax.Array,
+    clock: LightClock,
 ) -> Mover:
     """Lists what drivers see of one another: the agents and, last, the ego.
 
@@ -92,7 +100,7 @@ def all_movers(
         ego_place.next_lane,
         ego_place.s + ego_half,
         road_map,
-        light_time,
+        clock,
     )
     room = ego_stop.distance > ego.speed**2 / (2 * BRAKING)
     ego_held = (ego_stop.kind == STOP_LIGHT) & (ego_stop.light != LIGHT_GREEN) & room
@@ -111,14 +119,14 @@ def all_movers(
     )
 
 
-def stop_ahead(agents: Agents, road_map: RoadMap, light_time: jax.Array) -> StopAhead:
+def stop_ahead(agents: Agents, road_map: RoadMap, clock: LightClock) -> StopAhead:
     """The stop line on the lane an agent is on or on the one it will take next."""
     front = agents.lane_s + 0.5 * agents.length
-    return _next_line(planned_lane(agents, 0), agents.lanes[:, 1], front, road_map, light_time)
+    return _next_line(planned_lane(agents, 0), agents.lanes[:, 1], front, road_map, clock)
 
 
 def _next_line(
-    lane: jax.Array, next_lane: jax.Array, front: jax.Array, road_map: RoadMap, time: jax.Array
+    lane: jax.Array, next_lane: jax.Array, front: jax.Array, road_map: RoadMap, clock: LightClock
 ) -> StopAhead:
     """The stop line ahead of a front bumper at arc length `front`; next_lane may be -1."""
     following = jnp.where(next_lane >= 0, next_lane, lane)
@@ -128,7 +136,7 @@ def _next_line(
     kind_there = jnp.where(next_lane >= 0, road_map.lane_stop_kind[following], 0)
     governing = jnp.where(ahead, lane, following)
     light = jnp.maximum(road_map.lane_light[governing], 0)
-    colour = lights.state(time, road_map.light_start[light], road_map.light_cycle[light])
+    colour = lights.colour(light, clock, road_map)
     return StopAhead(
         distance=jnp.where(ahead, here, there),
         kind=jnp.where(ahead, road_map.lane_stop_kind[lane], kind_there),

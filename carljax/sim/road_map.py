@@ -47,6 +47,7 @@ class RoadMap(struct.PyTreeNode):
       point_lane: (P,) int32.
       light_cycle: (L,) s, period of the junction's programme.
       light_start: (L,) s, when within it this light turns green.
+      light_junction: (L,) int32, running index of its junction, -1 for a light on the open road.
       layers: (M, H, W) uint8, LAYER_* bits at `PIXELS_PER_METRE`; row = y, column = x.
       nearest_point: (M, H, W) int32, row in the point table of the nearest driving-lane point, -1
         beyond 30 m.
@@ -78,6 +79,7 @@ class RoadMap(struct.PyTreeNode):
     point_lane: jax.Array
     light_cycle: jax.Array
     light_start: jax.Array
+    light_junction: jax.Array
     layers: jax.Array
     nearest_point: jax.Array
     origin: jax.Array

@@ -75,6 +75,7 @@ def _lane_arrays(towns: Sequence[Town]) -> dict[str, np.ndarray]:
             "point_lane": table.point_lane + first.lane,
             "light_cycle": light.cycle,
             "light_start": light.start,
+            "light_junction": _shift(light.junction, first.junction),
         }
         for name, value in arrays.items():
             rows.setdefault(name, []).append(value)

@@ -69,12 +69,12 @@ class Route(struct.PyTreeNode):
 _POINT_FIELDS = ("xy", "yaw", "s", "lane", "lane_s", "speed_limit", "in_junction")
 
 
-def window(routes: Route, scenario_idx: jax.Array, route_idx: jax.Array) -> tuple[Route, jax.Array]:
+def window(routes: Route, episode_idx: jax.Array, route_idx: jax.Array) -> tuple[Route, jax.Array]:
     """The stretch of a route around the ego, so that a step copies 200 points instead of 1,000.
 
     Args:
       routes: the bank's, leading axis S; R is at least WINDOW.
-      scenario_idx: () int32.
+      episode_idx: () int32.
       route_idx: () int32, last passed point.
 
     Returns:
@@ -85,10 +85,10 @@ def window(routes: Route, scenario_idx: jax.Array, route_idx: jax.Array) -> tupl
     start = jnp.clip(route_idx - WINDOW_BACK, 0, num - WINDOW)
 
     def stretch(rows: jax.Array) -> jax.Array:
-        begin: list[Any] = [scenario_idx, start, *[0] * (rows.ndim - 2)]
+        begin: list[Any] = [episode_idx, start, *[0] * (rows.ndim - 2)]
         return jax.lax.dynamic_slice(rows, begin, (1, WINDOW, *rows.shape[2:]))[0]
 
-    whole = jax.tree.map(lambda x: x[scenario_idx], routes.replace(**dict.fromkeys(_POINT_FIELDS)))
+    whole = jax.tree.map(lambda x: x[episode_idx], routes.replace(**dict.fromkeys(_POINT_FIELDS)))
     part = {name: stretch(getattr(routes, name)) for name in _POINT_FIELDS}
     # Padding stays negative, so that it is never taken for a point of the window.
     far = jnp.int32(-(1 << 20))

@@ -190,7 +190,7 @@ def _assemble(
         last = values[-1:] if fill is None else np.full((1, *values.shape[1:]), fill)
         return np.concatenate([values, np.repeat(last, size - len(values), axis=0)])
 
-    # On the host: `scenario.make_bank` stacks the routes and puts them on the device.
+    # On the host: `episodes.make_bank` stacks the routes and puts them on the device.
     fields: dict[str, Any] = {
         "xy": pad(pose[:, :2], sizes.num_points).astype(np.float32),
         "yaw": pad(pose[:, 2], sizes.num_points).astype(np.float32),

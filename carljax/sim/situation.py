@@ -16,7 +16,7 @@ from carljax.sim.road_map import (
     nearest_lane,
 )
 from carljax.sim.route import Route
-from carljax.sim.types import LIGHT_GREEN, STOP_LIGHT, EgoState, Situation
+from carljax.sim.types import LIGHT_GREEN, STOP_LIGHT, EgoState, LightClock, Situation
 
 # Sample points along and across the ego's footprint, 0.6 m apart: the atlas resolves 0.5 m.
 FOOTPRINT = (9, 4)
@@ -31,7 +31,7 @@ def situation(
     stretch: Route,
     stretch_start: jax.Array,
     stretch_idx: jax.Array,
-    light_time: jax.Array,
+    clock: LightClock,
 ) -> Situation:
     """Looks up road and route.
 
@@ -42,7 +42,7 @@ def situation(
       stretch: window of the route around the ego.
       stretch_start: () int32, the window's first route index.
       stretch_idx: () int32, last passed point, counted from the window's start.
-      light_time: () s.
+      clock: of the lights.
 
     Returns:
       The situation; its route index counts from the route's start.
@@ -68,22 +68,22 @@ def situation(
         stop_yaw=stretch.stop_yaw,
         stop_width=stretch.stop_width,
         stop_kind=stretch.stop_kind,
-        stop_light=stop_lights(road_map, stretch, light_time),
+        stop_light=stop_lights(road_map, stretch, clock),
     )
 
 
-def stop_lights(road_map: RoadMap, stretch: Route, light_time: jax.Array) -> jax.Array:
+def stop_lights(road_map: RoadMap, stretch: Route, clock: LightClock) -> jax.Array:
     """(Q,) int32 LIGHT_* of each stop line of the route; LIGHT_GREEN where there is no light."""
     light = jnp.maximum(stretch.stop_light, 0)
-    colour = lights.state(light_time, road_map.light_start[light], road_map.light_cycle[light])
+    colour = lights.colour(light, clock, road_map)
     governed = (stretch.stop_kind == STOP_LIGHT) & (stretch.stop_light >= 0)
     return jnp.where(governed, colour, LIGHT_GREEN)
 
 
-def yellow_left(road_map: RoadMap, stretch: Route, light_time: jax.Array) -> jax.Array:
+def yellow_left(road_map: RoadMap, stretch: Route, clock: LightClock) -> jax.Array:
     """(Q,) s of yellow that remain at each stop line's light."""
     light = jnp.maximum(stretch.stop_light, 0)
-    return lights.yellow_left(light_time, road_map.light_start[light], road_map.light_cycle[light])
+    return lights.yellow_left_of(light, clock, road_map)
 
 
 def off_road_frac(

@@ -11,7 +11,7 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 
-from carljax.sim import geometry, idm
+from carljax.sim import geometry, idm, population
 from carljax.sim.idm import IDMParams
 from carljax.sim.right_of_way import (
     BRAKING,
@@ -26,7 +26,7 @@ from carljax.sim.right_of_way import (
     stop_ahead,
 )
 from carljax.sim.road_map import RoadMap, pose_at
-from carljax.sim.types import KIND_VEHICLE, Agents, EgoState
+from carljax.sim.types import KIND_VEHICLE, Agents, EgoState, LightClock
 
 FAR = 1e3  # m, a gap that changes nothing
 FORK_LENGTH = 9.0  # m in which lanes that part still overlap. source: ours, car length + width
@@ -36,11 +36,12 @@ STOP_MARGIN = 1.0  # m kept to a stop line. source: ours
 
 def step(
     agents: Agents,
+    others: Agents,
     ego: EgoState,
     ego_length: jax.Array,
     ego_place: EgoPlace,
     road_map: RoadMap,
-    light_time: jax.Array,
+    clock: LightClock,
     key: jax.Array,
     params: IDMParams,
     dt: float,
@@ -48,12 +49,13 @@ def step(
     """Moves all agents by one step.
 
     Args:
-      agents: (N,) agents.
+      agents: (N,) vehicles on lanes.
+      others: whoever else may stand or walk in their way.
       ego: the ego before its own step.
       ego_length: () m.
       ego_place: its place on the lane graph.
       road_map: the map.
-      light_time: () s.
+      clock: of the lights.
       key: PRNG key, for the choice of lanes.
       params: of the driver model.
       dt: s.
@@ -61,8 +63,8 @@ def step(
     Returns:
       The agents dt later.
     """
-    stop = stop_ahead(agents, road_map, light_time)
-    movers = all_movers(agents, stop, ego, ego_length, ego_place, road_map, light_time)
+    stop = stop_ahead(agents, road_map, clock)
+    movers = all_movers(agents, stop, ego, ego_length, ego_place, road_map, clock)
     accel = accelerations(agents, stop, movers, ego, ego_length, road_map, params)
     speed = jnp.maximum(agents.speed + accel * dt, 0.0)
     travelled = 0.5 * (agents.speed + speed) * dt
@@ -210,14 +212,8 @@ def initial(
     num = lane.shape[0]
     size = jax.random.uniform(key_size, (num, 2))
     temper = jax.random.uniform(key_temper, (num,), minval=0.7, maxval=1.1)
-    zeros = jnp.zeros(num, jnp.float32)
-    agents = Agents(
-        xy=jnp.zeros((num, 2), jnp.float32),
-        z=zeros,
-        yaw=zeros,
+    agents = population.nobody(num).replace(
         speed=jnp.where(lane >= 0, speed, 0.0),
-        yaw_rate=zeros,
-        accel=zeros,
         # From a small car to a van. source: spread of CARLA's car blueprints, 3.6 to 5.4 m by 1.8
         # to 2.2 m
         length=3.6 + 1.8 * size[:, 0],
@@ -226,7 +222,5 @@ def initial(
         lanes=plan(lane, road_map, key_plan),
         lane_s=s,
         desired_speed_frac=temper,
-        has_stopped=jnp.zeros(num, bool),
-        wait_s=zeros,
     )
     return place(agents, road_map)

@@ -1,9 +1,9 @@
 """The structs of the simulator: frozen pytrees, unbatched; `vmap` adds batch axes in front.
 
-Axes: T time, B environments, N agents, M towns, K lanes, P lane points, S scenarios, R route
-points, Q stop lines of a route, G speed signs of a route, D history steps. SI units and radians;
-float32 where no dtype is written. Frames are right-handed: x east, y north, yaw counter-clockwise
-in [-pi, pi).
+Axes: T time, B environments, N agents, M towns, K lanes, P lane points, S episodes of a bank, R
+route points, Q stop lines of a route, G speed signs of a route, E scenarios of a route, D history
+steps. SI units and radians; float32 where no dtype is written. Frames are right-handed: x east,
+y north, yaw counter-clockwise in [-pi, pi).
 """
 
 from __future__ import annotations
@@ -13,9 +13,15 @@ from typing import Any
 import jax
 from flax import struct
 
+from carljax.sim.scenarios.script import ScenarioSlots
+
 KIND_NONE, KIND_VEHICLE, KIND_PEDESTRIAN, KIND_STATIC = 0, 1, 2, 3
 STOP_NONE, STOP_LIGHT, STOP_SIGN, STOP_YIELD = 0, 1, 2, 3
 LIGHT_GREEN, LIGHT_YELLOW, LIGHT_RED = 0, 1, 2
+
+# Bits of `Agents.signals`: what a vehicle shows.
+SIGNAL_LEFT, SIGNAL_RIGHT, SIGNAL_BRAKE, SIGNAL_EMERGENCY = 1, 2, 4, 8
+DOOR_FRONT_LEFT, DOOR_FRONT_RIGHT, DOOR_REAR_LEFT, DOOR_REAR_RIGHT = 16, 32, 64, 128
 
 # A stop sign holds on the lane's last metres before its line; to halt is to halt with the box of
 # the ego over that strip. source: ours; CARLA's trigger boxes are as wide as the lane and a few
@@ -52,7 +58,7 @@ class EgoState(struct.PyTreeNode):
 
 
 class Agents(struct.PyTreeNode):
-    """The other road users.
+    """The other road users, one row each; `population` says which rows are whose.
 
     Attributes:
       xy: (N, 2) m, box centre.
@@ -62,12 +68,21 @@ class Agents(struct.PyTreeNode):
       yaw_rate: (N,) rad/s.
       accel: (N,) m/s^2 over the last step.
       length, width: (N,) m.
-      kind: (N,) int32, KIND_NONE marks an empty slot.
+      kind: (N,) int32, KIND_NONE marks an empty row.
+      model: (N,) int32, row in the table of vehicle classes (`vehicles`); 0 for others.
+      signals: (N,) int32, SIGNAL_* and DOOR_* bits.
       lanes: (N, 3) int32, the lane it is on and the two it will take next; -1 past a dead end.
       lane_s: (N,) m, arc length on lanes[:, 0].
       desired_speed_frac: (N,) this driver's free speed as a fraction of the limit.
       has_stopped: (N,) bool, has come to rest at the stop sign, or at the green light, ahead.
       wait_s: (N,) s, time at rest.
+      lateral: (N,) m, offset from the lane's centre, positive to its left; a lane change brings it
+        to 0.
+      from_lane: (N,) int32, the lane that it still leaves during a lane change, else -1.
+      cruise_speed: (N,) m/s, free speed that a scenario asks for; 0 leaves it to limit and temper.
+      is_lawless: (N,) bool, a scenario's driver, who minds neither lights, signs, right of way nor
+        the ego, only the cars ahead in its lane.
+      is_braking_hard: (N,) bool, a scenario makes it brake to a halt.
     """
 
     xy: jax.Array
@@ -79,11 +94,18 @@ class Agents(struct.PyTreeNode):
     length: jax.Array
     width: jax.Array
     kind: jax.Array
+    model: jax.Array
+    signals: jax.Array
     lanes: jax.Array
     lane_s: jax.Array
     desired_speed_frac: jax.Array
     has_stopped: jax.Array
     wait_s: jax.Array
+    lateral: jax.Array
+    from_lane: jax.Array
+    cruise_speed: jax.Array
+    is_lawless: jax.Array
+    is_braking_hard: jax.Array
 
     @property
     def valid(self) -> jax.Array:
@@ -196,15 +218,53 @@ class RewardTerms(struct.PyTreeNode):
     penalty: jax.Array
 
 
+class LightClock(struct.PyTreeNode):
+    """What the traffic lights show now: their programme, and junctions that scenarios hold.
+
+    Attributes:
+      time: () s, clock of the programmes (starts at a random phase).
+      held_junction: (H,) int32, junction whose lights are held, -1 for none; one row a scenario
+        slot.
+      held_green: (H, 2) int32, rows of the light table that are green while held, -1 pads.
+      held_from, held_until: (H,) s on `time`, when the hold began and when it will end.
+    """
+
+    time: jax.Array
+    held_junction: jax.Array
+    held_green: jax.Array
+    held_from: jax.Array
+    held_until: jax.Array
+
+
+class Walkers(struct.PyTreeNode):
+    """What pedestrians have in mind; their bodies are rows of `Agents`.
+
+    Attributes:
+      node: (W,) int32, node of the town's walk graph that it comes from; -1 for nobody.
+      target: (W,) int32, node it walks to.
+      pace: (W,) m/s, its own walking speed.
+      offset: (W,) m, how far to the left of the line between nodes it walks.
+      is_reckless: (W,) bool, does not look before it crosses.
+    """
+
+    node: jax.Array
+    target: jax.Array
+    pace: jax.Array
+    offset: jax.Array
+    is_reckless: jax.Array
+
+
 class SimState(struct.PyTreeNode):
     """The whole state of one environment: a few kB, no map and no image.
 
     Attributes:
       ego, agents: see above.
       reward_state: see `RewardState`.
-      scenario_idx: () int32 into the bank.
+      episode_idx: () int32 into the bank.
       route_idx: () int32, last passed route point.
-      light_time: () s, clock of the traffic lights (starts at a random phase).
+      walkers: see above.
+      scenarios: the route's scenarios in play.
+      lights: see above.
       step_count: () int32.
       key: () PRNG key.
     """
@@ -212,9 +272,11 @@ class SimState(struct.PyTreeNode):
     ego: EgoState
     agents: Agents
     reward_state: RewardState
-    scenario_idx: jax.Array
+    episode_idx: jax.Array
     route_idx: jax.Array
-    light_time: jax.Array
+    walkers: Walkers
+    scenarios: ScenarioSlots
+    lights: LightClock
     step_count: jax.Array
     key: jax.Array
 

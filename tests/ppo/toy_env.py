@@ -24,7 +24,7 @@ class ToyEnv:
     """The first action moves the dot; the reward is 1 - |x|; leaving [-1, 1] terminates.
 
     Attributes:
-      starts: (S,) positions to start from, an array argument as a scenario bank is.
+      starts: (S,) positions to start from, an array argument as an episode bank is.
       limit: steps after which an episode is truncated.
     """
 

@@ -6,13 +6,14 @@ import jax
 import numpy as np
 
 from carljax.reward import reward
+from carljax.sim import lights, population
 from carljax.sim.bicycle import VehicleParams
+from carljax.sim.scenarios import script
 from carljax.sim.types import (
     KIND_NONE,
     KIND_VEHICLE,
     LIGHT_GREEN,
     STOP_NONE,
-    Agents,
     EgoState,
     SimState,
     Situation,
@@ -47,15 +48,14 @@ def make_agents(num=2, **fields):
         "width": np.full(num, 2.0),
         "desired_speed_frac": np.ones(num),
         "kind": np.where(np.arange(num) < filled, KIND_VEHICLE, KIND_NONE),
-        "lanes": np.full((num, 3), -1),
-        "has_stopped": np.zeros(num, bool),
     }
-    for name in ("z", "yaw", "speed", "yaw_rate", "accel", "lane_s", "wait_s"):
+    for name in ("z", "yaw", "speed", "yaw_rate", "accel"):
         defaults[name] = np.zeros(num)
     for name, value in fields.items():
         defaults[name][: len(value)] = value
-    kinds = {"kind": np.int32, "lanes": np.int32, "has_stopped": bool}
-    return Agents(**{k: np.asarray(v, kinds.get(k, np.float32)) for k, v in defaults.items()})
+    empty = population.nobody(num)
+    kept = {k: np.asarray(v, getattr(empty, k).dtype) for k, v in defaults.items()}
+    return jax.tree.map(np.asarray, empty.replace(**kept))
 
 
 def make_situation(num_lines=3, **fields):
@@ -98,9 +98,11 @@ def make_state(ego, agents, situation, step_count=0, **memory):
         reward_state=reward.init(ego, situation.stop_kind.shape[0]).replace(
             **{"route_s": situation.route_s, **memory}
         ),
-        scenario_idx=np.int32(0),
+        episode_idx=np.int32(0),
         route_idx=situation.route_idx,
-        light_time=f32(0.0),
+        walkers=population.no_walkers(0),
+        scenarios=script.empty_slots(0),
+        lights=lights.clock(f32(0.0), 0),
         step_count=np.int32(step_count),
         key=np.uint32(0),
     )

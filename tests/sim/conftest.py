@@ -6,11 +6,11 @@ from traffic_world import World
 
 from carljax.reward.config import RewardConfig
 from carljax.sim import env as env_module
-from carljax.sim import scenario, town, towns
+from carljax.sim import episodes, town, towns
 from carljax.sim.env import EnvConfig
 from carljax.sim.rasterizer import RasterConfig
 
-NUM_SCENARIOS, NUM_AGENTS, ROUTE_LENGTH = 6, 6, 200.0
+NUM_EPISODES, NUM_AGENTS, ROUTE_LENGTH = 6, 6, 200.0
 
 
 @pytest.fixture(scope="session")
@@ -29,12 +29,14 @@ def world():
 def small_env(bundled):
     """Short routes, alternately in the grid and in the village, few cars, small images."""
     there = [bundled["grid"], bundled["village"]]
-    bank = scenario.make_bank(there, NUM_SCENARIOS, NUM_AGENTS, 0, ROUTE_LENGTH)
     config = EnvConfig(
         num_agents=NUM_AGENTS,
+        num_pedestrians=0,
+        num_scenario_slots=0,
         route_length=ROUTE_LENGTH,
         raster=RasterConfig(32, 32, pixels_per_metre=0.5, ego_from_bottom_px=12),
     )
+    bank = episodes.make_bank(there, NUM_EPISODES, config.population, 0, ROUTE_LENGTH)
     return env_module.make_env(bank, config, RewardConfig())
 
 

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from carljax.sim import atlas
+from carljax.sim.population import nobody
 from carljax.sim.road_map import RoadMap
 from carljax.sim.road_network import MARK_BROKEN, MARK_SOLID, Lane, RoadMark, RoadNetwork
 from carljax.sim.route import Route
@@ -98,14 +99,11 @@ def agents_of(*users: dict[str, float], slots: int = 8) -> Agents:
     def column(name: str) -> np.ndarray:
         return np.array([user.get(name, 0.0) for user in users] + [0.0] * (slots - len(users)))
 
-    values = {
-        field.name: column(field.name).astype(np.float32) for field in dataclasses.fields(Agents)
-    }
-    values["xy"] = np.stack([column("x"), column("y")], axis=-1).astype(np.float32)
-    values["kind"] = column("kind").astype(np.int32)
-    values["lanes"] = np.full((slots, 3), -1, np.int32)
-    values["has_stopped"] = np.zeros(slots, bool)
-    return Agents(**{name: jnp.asarray(value) for name, value in values.items()})
+    empty = nobody(slots)
+    given = {name for user in users for name in user} - {"x", "y"}
+    values = {name: jnp.asarray(column(name), getattr(empty, name).dtype) for name in given}
+    xy = jnp.asarray(np.stack([column("x"), column("y")], axis=-1), jnp.float32)
+    return empty.replace(xy=xy, **values)
 
 
 def route_east(start: float = -100.0, num: int = 201, **rest) -> Route:

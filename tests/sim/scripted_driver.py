@@ -36,11 +36,11 @@ def pedal(env, speed, wanted):
 
 def follow(env, sim, obeys, speed):
     """Steers along the route; stops for lights that are not green and for stop signs."""
-    stretch, first = route.window(env.bank.routes, sim.scenario_idx, sim.route_idx)
+    stretch, first = route.window(env.bank.routes, sim.episode_idx, sim.route_idx)
     idx = sim.route_idx - first
     ego = sim.ego
     target = stretch.xy[jnp.minimum(idx + LOOK_AHEAD, stretch.num_points - 1)]
-    lights = situation.stop_lights(env.bank.road_map, stretch, sim.light_time)
+    lights = situation.stop_lights(env.bank.road_map, stretch, sim.lights)
     closed = (stretch.stop_kind == STOP_LIGHT) & (lights != LIGHT_GREEN)
     closed |= (stretch.stop_kind == STOP_SIGN) & ~sim.reward_state.stop_satisfied
     bumper = stretch.s[idx] + 0.5 + 0.5 * env.vehicle.length
@@ -83,13 +83,13 @@ def fetch(state):
 
 
 start = jax.jit(
-    jax.vmap(lambda env, scenario, key: env.start_scenario(scenario, key), in_axes=(None, 0, 0))
+    jax.vmap(lambda env, episode, key: env.start_episode(episode, key), in_axes=(None, 0, 0))
 )
 
 
-def episodes(env, scenarios, keys, script, speed, num_steps=1300):
-    """Episodes on given scenarios until all have ended: States without images, (B, T, ...)."""
-    states = start(env, scenarios, keys)
+def episodes(env, episodes, keys, script, speed, num_steps=1300):
+    """Episodes on given episodes until all have ended: States without images, (B, T, ...)."""
+    states = start(env, episodes, keys)
     chunks = []
     while len(chunks) * CHUNK < num_steps and not (states.done > 0).all():
         states, chunk = drive_on(env, states, script, speed)

@@ -96,10 +96,10 @@ def test_an_end_is_shown_and_the_next_step_begins_anew(rollout):
 
 def test_restarts_are_new(rollout):
     count = fetch(rollout, lambda s: s.pipeline_state.step_count)
-    scenario = fetch(rollout, lambda s: s.pipeline_state.scenario_idx)
-    clock = fetch(rollout, lambda s: s.pipeline_state.light_time)
+    episode = fetch(rollout, lambda s: s.pipeline_state.episode_idx)
+    clock = fetch(rollout, lambda s: s.pipeline_state.lights.time)
     fresh = count == 0
-    assert len(set(scenario[fresh])) > 3
+    assert len(set(episode[fresh])) > 3
     assert len(set(clock[fresh])) == fresh.sum()
 
 
@@ -122,7 +122,7 @@ def test_a_restart_ignores_the_action_and_a_running_episode_the_key(small_env, r
     for b in range(NUM_ENVS):
         same = [
             np.array_equal(one.pipeline_state.ego.steer[b], x.pipeline_state.ego.steer[b])
-            and np.array_equal(one.pipeline_state.light_time[b], x.pipeline_state.light_time[b])
+            and np.array_equal(one.pipeline_state.lights.time[b], x.pipeline_state.lights.time[b])
             for x in (other, rekeyed)
         ]
         assert same == ([True, False] if done[t, b] else [False, True])

@@ -13,12 +13,12 @@ from carljax.reward import reward
 from carljax.sim import town as towns_module
 from carljax.sim.env import ENDS, METRICS
 
-NUM = 6  # scenarios of the small environment
+NUM = 6  # episodes of the small environment
 CAUSES = reward.CAUSES
 
 
 def drive(env, script, speed=5.0, seed=0):
-    """Episodes on all scenarios: (6, T, ...)."""
+    """Episodes on all episodes: (6, T, ...)."""
     keys = jax.random.split(jax.random.key(seed), NUM)
     return episodes(env, jnp.arange(NUM), keys, jnp.int32(script), jnp.float32(speed))
 
@@ -85,21 +85,21 @@ def test_reset_draws_a_scenario_and_stands_at_its_start(small_env, reset):
     seen = set()
     for seed in range(12):
         sim = reset(seed).pipeline_state
-        k = int(sim.scenario_idx)
+        k = int(sim.episode_idx)
         seen.add(k)
         np.testing.assert_array_equal(sim.ego.xy, small_env.bank.routes.xy[k, 0])
         np.testing.assert_array_equal(sim.ego.yaw, small_env.bank.routes.yaw[k, 0])
         np.testing.assert_array_equal(sim.agents.xy, small_env.bank.agents.xy[k])
         assert sim.ego.speed == 0 and sim.step_count == 0 and sim.route_idx == 0
-        assert 0 <= sim.light_time < 600
+        assert 0 <= sim.lights.time < 600
     assert len(seen) > 2
 
 
 def test_the_same_key_gives_the_same_episode(small_env, reset):
-    assert int(reset(3).pipeline_state.scenario_idx) == int(reset(3).pipeline_state.scenario_idx)
+    assert int(reset(3).pipeline_state.episode_idx) == int(reset(3).pipeline_state.episode_idx)
     one, again, other = (drive(small_env, FULL_THROTTLE, seed=s) for s in (0, 0, 1))
     chex.assert_trees_all_equal(one, again)
-    clock = [path.pipeline_state.light_time[:, 0] for path in (one, other)]
+    clock = [path.pipeline_state.lights.time[:, 0] for path in (one, other)]
     assert not np.array_equal(*clock)
 
 
@@ -252,7 +252,7 @@ def test_a_failure_at_the_time_limit_is_a_failure(empty_env):
 
 
 def test_the_clock_of_the_lights_goes_on(careful):
-    time = careful.pipeline_state.light_time[:, :200].astype(float)
+    time = careful.pipeline_state.lights.time[:, :200].astype(float)
     np.testing.assert_allclose(np.diff(time, axis=1), 0.1, atol=1e-3)
     assert len(set(np.round(time[:, 0], 3))) == NUM
 

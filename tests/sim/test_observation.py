@@ -13,8 +13,9 @@ from crossing_world import ego_at
 
 from carljax.render import image
 from carljax.reward.config import RewardConfig
-from carljax.sim import observation, rasterizer, scenario, situation, town
+from carljax.sim import episodes, observation, rasterizer, situation, town
 from carljax.sim.env import EnvConfig, make_env
+from carljax.sim.population import Population
 from carljax.sim.rasterizer import CHANNELS, RasterConfig
 
 
@@ -107,10 +108,14 @@ def test_the_map_picture_has_north_up():
 
 def test_an_environment_shows_the_route_from_where_the_ego_is():
     path = importlib.resources.files("carljax.sim.towns") / "village.xodr"
-    bank = scenario.make_bank([town.load(path)], 1, 8, seed=3, route_length=400.0)
+    bank = episodes.make_bank([town.load(path)], 1, Population(8, 0, 0), seed=3, route_length=400.0)
     config = RasterConfig(64, 64, 1.0, 16, route_everywhere=True)
-    env = make_env(bank, EnvConfig(num_agents=8, raster=config), RewardConfig())
-    sim = jax.jit(env.start_scenario)(jnp.int32(0), jax.random.key(0)).pipeline_state
+    env = make_env(
+        bank,
+        EnvConfig(num_agents=8, num_pedestrians=0, num_scenario_slots=0, raster=config),
+        RewardConfig(),
+    )
+    sim = jax.jit(env.start_episode)(jnp.int32(0), jax.random.key(0)).pipeline_state
     route = jax.tree.map(lambda x: x[0], bank.routes)
     memory = sim.reward_state.replace(stopped_s=jnp.float32(9.0), ttc_ticks=jnp.int32(50))
     sim = sim.replace(
@@ -127,8 +132,8 @@ def test_an_environment_shows_the_route_from_where_the_ego_is():
         bank.road_map,
         route,
         sim.route_idx,
-        situation.stop_lights(bank.road_map, route, sim.light_time),
-        situation.yellow_left(bank.road_map, route, sim.light_time),
+        situation.stop_lights(bank.road_map, route, sim.lights),
+        situation.yellow_left(bank.road_map, route, sim.lights),
         memory.stop_satisfied,
         config=config,
     )

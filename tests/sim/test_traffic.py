@@ -3,7 +3,6 @@
 import functools
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from small_world import LIMIT, crossing
@@ -20,11 +19,13 @@ from traffic_world import (
     overlaps,
     overlaps_jit,
     stop_ahead_jit,
+    with_values,
 )
 
-from carljax.sim import lights, scenario, town
+from carljax.sim import episodes, lights, town
 from carljax.sim.env import TRAFFIC_ACCEL, TRAFFIC_BRAKE
 from carljax.sim.idm import IDMParams
+from carljax.sim.population import Population
 from carljax.sim.types import (
     KIND_NONE,
     KIND_VEHICLE,
@@ -32,14 +33,13 @@ from carljax.sim.types import (
     LIGHT_RED,
     STOP_LIGHT,
     STOP_SIGN,
-    Agents,
 )
 
 # Leaders
 
 
 def leader(world, agents, ego=None, place=None):
-    stop = stop_ahead_jit(agents, world.map, f32(0.0))
+    stop = stop_ahead_jit(agents, world.map, lights.clock(f32(0.0), 0))
     got = leaders_jit(agents, stop, ego or make_ego(), place or ego_place(), world.map)
     return float(got[0][0]), float(got[1][0])
 
@@ -142,18 +142,14 @@ def random_cars(table, num, rng):
         for k in (1, 2):
             onward = table.successors[plans[i, k - 1]]
             plans[i, k] = rng.choice(onward[onward >= 0])
-    values = {name: np.zeros(num) for name in Agents.__dataclass_fields__}
-    values |= {
-        "xy": np.zeros((num, 2)),
+    values = {
         "lanes": plans,
         "lane_s": rng.uniform(0, 1, num) * np.minimum(table.length[plans[:, 0]], 40.0),
         "speed": rng.uniform(0, 12, num),
         "length": rng.uniform(3.6, 5.4, num),
         "kind": np.where(rng.uniform(size=num) < 0.9, KIND_VEHICLE, KIND_NONE),
-        "has_stopped": np.zeros(num, bool),
     }
-    kept = {"lanes": np.int32, "kind": np.int32, "has_stopped": bool}
-    return Agents(**{k: jnp.asarray(v, kept.get(k, jnp.float32)) for k, v in values.items()})
+    return with_values(num, values)
 
 
 def leader_oracle(table, agents, i):
@@ -186,7 +182,7 @@ def test_leaders_match_a_float64_oracle(bank, bundled):
     num_led = 0
     for _ in range(4):
         agents = random_cars(table, 96, rng)
-        stop = stop_ahead_jit(agents, bank.road_map, f32(0.0))
+        stop = stop_ahead_jit(agents, bank.road_map, lights.clock(f32(0.0), 0))
         gap, speed = leaders_jit(agents, stop, make_ego(), ego_place(), bank.road_map)
         host = jax.tree.map(np.asarray, agents)
         for i in np.flatnonzero(host.kind):
@@ -258,7 +254,7 @@ DRIVER = IDMParams(accel_max=TRAFFIC_ACCEL, comfort_brake=TRAFFIC_BRAKE)  # the 
 @pytest.fixture(scope="module")
 def bank(bundled):
     there = [bundled[name] for name in TOWN_ORDER]
-    return scenario.make_bank(there, 66, CARS, seed=3, route_length=400.0)
+    return episodes.make_bank(there, 66, Population(CARS, 0, 0), seed=3, route_length=400.0)
 
 
 @pytest.fixture(scope="module")
@@ -367,7 +363,7 @@ def test_everybody_halts_at_stop_signs(minute, bank):
 
 
 def test_nobody_overlaps_at_the_start(bank):
-    assert bank.num_scenarios >= 64
+    assert bank.num_episodes >= 64
     assert not overlaps_jit(bank.agents).any()
 
 
@@ -386,7 +382,7 @@ def test_the_start_is_free_around_the_ego_and_filled_around_that(bank):
 
 def test_nobody_starts_faster_than_can_be_stopped(bank):
     path, rows = jax.tree.map(np.asarray, bank.agents), jax.tree.map(np.asarray, bank.road_map)
-    for e in range(bank.num_scenarios):
+    for e in range(bank.num_episodes):
         for i in np.flatnonzero(path.kind[e]):
             lane, s, speed = path.lanes[e, i, 0], path.lane_s[e, i], path.speed[e, i]
             on = (path.kind[e] != KIND_NONE) & (path.lanes[e, :, 0] == lane)
@@ -398,6 +394,7 @@ def test_nobody_starts_faster_than_can_be_stopped(bank):
 
 def test_the_same_seed_gives_the_same_bank():
     there = [town.from_network(crossing())]
-    one, again = (scenario.make_bank(there, 4, 8, seed=0, route_length=30.0) for _ in range(2))
+    room = Population(8, 0, 0)
+    one, again = (episodes.make_bank(there, 4, room, seed=0, route_length=30.0) for _ in range(2))
     jax.tree.map(np.testing.assert_array_equal, one, again)
     assert len({x.tobytes() for x in np.asarray(one.agents.xy)}) == 4

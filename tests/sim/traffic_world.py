@@ -10,18 +10,21 @@ import jax.numpy as jnp
 import numpy as np
 from small_world import LIMIT, approach, crossing, inner, leaving, road
 
-from carljax.sim import geometry, right_of_way, traffic
+from carljax.sim import geometry, lights, population, right_of_way, traffic
 from carljax.sim import road_map_builder as builder
 from carljax.sim import town as towns_module
 from carljax.sim.idm import IDMParams
 from carljax.sim.right_of_way import EgoPlace
-from carljax.sim.types import KIND_NONE, KIND_VEHICLE, Agents, EgoState
+from carljax.sim.types import KIND_NONE, KIND_VEHICLE, EgoState
 
 DT = 0.1
 DRIVER = IDMParams()
 SLOTS, STEPS = 8, 400
 EGO_LENGTH = 4.9
 ALL = ("east", "north", "west", "south")
+
+
+NOBODY = population.nobody(1)
 
 
 def f32(value):
@@ -44,7 +47,10 @@ def drive(road_map, agents, light_time, key, ego, place, num_steps, driver=DRIVE
 
     def step(carry, key):
         agents, time = carry
-        after = traffic.step(agents, ego, f32(EGO_LENGTH), place, road_map, time, key, driver, DT)
+        clock = lights.clock(time, 0)
+        after = traffic.step(
+            agents, NOBODY, ego, f32(EGO_LENGTH), place, road_map, clock, key, driver, DT
+        )
         return (after, time + DT), after
 
     _, path = jax.lax.scan(step, (agents, light_time), jax.random.split(key, num_steps))
@@ -99,6 +105,13 @@ class World:
         return jax.tree.map(np.asarray, path)
 
 
+def with_values(num, values):
+    """Agents, `nobody` but for the given columns."""
+    empty = population.nobody(num)
+    kept = {name: jnp.asarray(v, getattr(empty, name).dtype) for name, v in values.items()}
+    return empty.replace(**kept)
+
+
 def cars(world, *specs):
     """Agents from dicts with lanes and s; 4 m by 2 m unless told otherwise; other slots empty."""
     values = {
@@ -116,11 +129,7 @@ def cars(world, *specs):
         values["kind"][slot] = KIND_VEHICLE
         for name, value in spec.items():
             values[name][slot] = value
-    zeros = np.zeros(SLOTS)
-    values |= {"xy": np.zeros((SLOTS, 2)), "z": zeros, "yaw": zeros}
-    values |= {"yaw_rate": zeros, "accel": zeros}
-    kept = {"lanes": np.int32, "kind": np.int32, "has_stopped": bool}
-    agents = Agents(**{k: jnp.asarray(v, kept.get(k, jnp.float32)) for k, v in values.items()})
+    agents = with_values(SLOTS, values)
     return place_jit(agents, world.map)
 
 
@@ -163,7 +172,9 @@ def enters_at(path, slot, lane):
 leaders_jit = jax.jit(
     lambda agents, stop, ego, place, road_map: traffic.leaders(
         agents,
-        right_of_way.all_movers(agents, stop, ego, f32(EGO_LENGTH), place, road_map, f32(0.0)),
+        right_of_way.all_movers(
+            agents, stop, ego, f32(EGO_LENGTH), place, road_map, lights.clock(f32(0.0), 0)
+        ),
         road_map,
     )
 )
@@ -180,6 +191,6 @@ gated_jit = jax.jit(
 
 
 def is_gated(world, agents, time=0.0, ego=None, place=None):
-    stop = stop_ahead_jit(agents, world.map, f32(time))
+    stop = stop_ahead_jit(agents, world.map, lights.clock(f32(time), 0))
     ego, place = ego or make_ego(), place or ego_place()
-    return bool(gated_jit(agents, stop, ego, place, world.map, f32(time))[0])
+    return bool(gated_jit(agents, stop, ego, place, world.map, lights.clock(f32(time), 0))[0])

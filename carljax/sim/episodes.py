@@ -1,12 +1,13 @@
-"""The bank of scenarios: routes and traffic made ahead, drawn from at every reset.
+"""The bank of episodes: routes and traffic made ahead, drawn from at every reset.
 
-A scenario is a route and the traffic at its start. The phase of the lights and every choice that
-traffic makes later are drawn anew, so no two episodes on one scenario are the same.
+A episode is a route and the traffic at its start. The phase of the lights and every choice that
+traffic makes later are drawn anew, so no two episodes on one episode are the same.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -15,11 +16,14 @@ from flax import struct
 
 from carljax.sim import road_map_builder, route_generator, spawn, traffic
 from carljax.sim import route as route_module
+from carljax.sim.population import Population, no_walkers, nobody
 from carljax.sim.road_map import RoadMap
 from carljax.sim.route import Route
 from carljax.sim.route_generator import RouteSizes
+from carljax.sim.scenarios import script
+from carljax.sim.scenarios.script import Scenario
 from carljax.sim.town import Town, offsets
-from carljax.sim.types import Agents
+from carljax.sim.types import Agents, Walkers
 
 TRAFFIC_RADIUS = 140.0  # m around the start, where traffic stands at first
 EGO_CLEARANCE = 18.0  # m kept free around the start
@@ -29,43 +33,42 @@ ROUTE_SLACK = 8  # route points beyond one per metre
 _initial = jax.jit(jax.vmap(traffic.initial, in_axes=(0, 0, 0, None, 0)))
 
 
-class ScenarioBank(struct.PyTreeNode):
+class EpisodeBank(struct.PyTreeNode):
     """All that stays the same while training: held once per device.
 
     Attributes:
       road_map: the towns.
       routes: `Route` with a leading axis S.
       agents: `Agents` at the start, with a leading axis S.
+      walkers: `Walkers` at the start, with a leading axis S.
+      scenarios: `Scenario` with leading axes S, E, in order along each route.
     """
 
     road_map: RoadMap
     routes: Route
     agents: Agents
+    walkers: Walkers
+    scenarios: Scenario
 
     @property
-    def num_scenarios(self) -> int:
+    def num_episodes(self) -> int:
         """S."""
         return self.agents.kind.shape[0]
-
-    @property
-    def num_agents(self) -> int:
-        """N."""
-        return self.agents.kind.shape[1]
 
 
 def make_bank(
     towns: Sequence[Town],
-    num_scenarios: int,
-    num_agents: int,
+    num_episodes: int,
+    population: Population,
     seed: int,
     route_length: float = 1000.0,
-) -> ScenarioBank:
-    """Draws scenarios, the same number in every town (as evenly as it goes).
+) -> EpisodeBank:
+    """Draws episodes, the same number in every town (as evenly as it goes).
 
     Args:
       towns: at least one.
-      num_scenarios: S.
-      num_agents: N, the most agents in a scenario.
+      num_episodes: S.
+      population: how many of each kind of road user there is room for.
       seed: of everything drawn; other seeds give other routes.
       route_length: m.
 
@@ -79,26 +82,39 @@ def make_bank(
     found = [spawn.places(town.lanes) for town in towns]
     firsts = offsets(towns)
     routes, agents = [], []
-    for number in range(num_scenarios):
+    for number in range(num_episodes):
         town = number % len(towns)
         rng = np.random.default_rng([seed, number])
         route = route_generator.draw(towns[town], firsts[town], route_length, sizes, rng)
         routes.append(route)
-        agents.append(_traffic(towns[town], found[town], firsts[town].lane, route, num_agents, rng))
+        agents.append(
+            _traffic(
+                towns[town], found[town], firsts[town].lane, route, population.num_traffic, rng
+            )
+        )
     lane, s, speed = (np.stack(values) for values in zip(*agents, strict=True))
     road_map = road_map_builder.build(towns)
-    keys = jax.random.split(jax.random.key(seed), num_scenarios)
-    return ScenarioBank(
+    keys = jax.random.split(jax.random.key(seed), num_episodes)
+    cars = _initial(
+        jnp.asarray(lane, jnp.int32),
+        jnp.asarray(s, jnp.float32),
+        jnp.asarray(speed, jnp.float32),
+        road_map,
+        keys,
+    )
+    rest = _repeat(nobody(population.num_agents - population.num_traffic), num_episodes)
+    return EpisodeBank(
         road_map=road_map,
         routes=jax.tree.map(lambda *x: jnp.asarray(np.stack(x)), *routes),
-        agents=_initial(
-            jnp.asarray(lane, jnp.int32),
-            jnp.asarray(s, jnp.float32),
-            jnp.asarray(speed, jnp.float32),
-            road_map,
-            keys,
-        ),
+        agents=jax.tree.map(lambda *x: jnp.concatenate(x, axis=1), cars, rest),
+        walkers=_repeat(no_walkers(population.num_walkers), num_episodes),
+        scenarios=_repeat(script.nothing(1), num_episodes),
     )
+
+
+def _repeat(rows: Any, num: int) -> Any:
+    """The same rows for every episode."""
+    return jax.tree.map(lambda x: jnp.repeat(jnp.asarray(x)[None], num, axis=0), rows)
 
 
 def _traffic(

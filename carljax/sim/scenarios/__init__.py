@@ -1,0 +1,1 @@
+"""The safety-critical scenarios: one file each, data for one small engine."""

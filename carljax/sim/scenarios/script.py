@@ -1,0 +1,204 @@
+"""What a scenario is to the simulator: data, whatever its kind.
+
+A scenario is placed on a route ahead of time, on the host (one file for each kind beside this one),
+and played by one engine on the device. It has a few actors and a few effects, and all that differs
+between kinds is numbers here: so a new kind costs the compiled program nothing. All distances are
+arc lengths on the ego's route unless they say otherwise.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+
+NUM_CARS = 4  # actors of a scenario that drive on lanes
+NUM_OTHERS = 3  # actors that stand or move straight on: pedestrians, bicycles, obstacles, doors
+NUM_PATCHES = 3  # stretches of disturbed control
+
+# How a car of a scenario drives.
+DRIVE_LEGAL = 0  # as other traffic does
+DRIVE_FLOW = 1  # at its own speed, minding only cars ahead; starts again at its source
+DRIVE_MEET = 2  # likewise, but so as to be at `meet_lane_s` when the ego is at `meet_s`
+
+
+class ScriptedCars(struct.PyTreeNode):
+    """Actors on lanes, L = NUM_CARS rows.
+
+    Attributes:
+      model: (L,) int32, row in the table of vehicle classes; -1 for no car.
+      lanes: (L, 3) int32, the lanes of its way, -1 pads.
+      s: (L,) m on the first of them, where it starts.
+      speed: (L,) m/s, at the start and its free speed; 0 leaves it to the limit.
+      drive: (L,) int32, DRIVE_*.
+      travel: (L,) m along its way: a DRIVE_FLOW car that has come so far starts again.
+      meet_s: (L,) m on the route, where its way meets the ego's.
+      meet_lane_s: (L,) m along its way from the beginning of lanes[0], the same place.
+      signals: (L,) int32, SIGNAL_* bits it always shows.
+      from_trigger: (L,) bool, appears and drives at the trigger; else as soon as it is armed.
+    """
+
+    model: jax.Array
+    lanes: jax.Array
+    s: jax.Array
+    speed: jax.Array
+    drive: jax.Array
+    travel: jax.Array
+    meet_s: jax.Array
+    meet_lane_s: jax.Array
+    signals: jax.Array
+    from_trigger: jax.Array
+
+
+class ScriptedOthers(struct.PyTreeNode):
+    """Actors off the lanes, F = NUM_OTHERS rows: they stand, then move straight on, then stand.
+
+    Attributes:
+      kind: (F,) int32, KIND_*; KIND_NONE for nobody.
+      xy: (F, 2) m, where it stands at first.
+      yaw: (F,) rad.
+      length, width: (F,) m.
+      speed: (F,) m/s, once it moves; 0 stands for good.
+      distance: (F,) m that it moves.
+      meet_s: (F,) m on the route, where its way meets the ego's.
+      start_time: (F,) s: it starts when the ego would need less than this to `meet_s`.
+      start_distance: (F,) m: or when the ego is nearer to it than this.
+      signals: (F,) int32, SIGNAL_* and DOOR_* bits it shows from its start on.
+    """
+
+    kind: jax.Array
+    xy: jax.Array
+    yaw: jax.Array
+    length: jax.Array
+    width: jax.Array
+    speed: jax.Array
+    distance: jax.Array
+    meet_s: jax.Array
+    start_time: jax.Array
+    start_distance: jax.Array
+    signals: jax.Array
+
+
+class Scenario(struct.PyTreeNode):
+    """One scenario on a route (the bank holds (S, E) of them, in order of `arm_s`).
+
+    Attributes:
+      kind: () int32, place in `registry.KINDS`; -1 pads.
+      arm_s: () m: when the ego comes here its actors take their places, out of sight.
+      trigger_s: () m: from here on it plays.
+      end_s: () m: it is over when the ego comes here.
+      timeout_s: () s after the trigger; later it is over all the same, and held against the ego.
+      cars: see `ScriptedCars`.
+      others: see `ScriptedOthers`.
+      held_junction: () int32, junction whose lights are held from the trigger on; -1 for none.
+      held_green: (2,) int32, rows of the light table that are green there; -1 pads.
+      brake_s: () s for which the car ahead of the ego brakes hard; 0 for no such thing.
+      patches: (NUM_PATCHES, 2) m on the route, first and last of stretches where the ego's control
+        is disturbed; equal ends pad.
+      steer_noise, throttle_noise: () how much, in units of the action: the half-width of a uniform
+        distribution drawn anew for each patch.
+    """
+
+    kind: jax.Array
+    arm_s: jax.Array
+    trigger_s: jax.Array
+    end_s: jax.Array
+    timeout_s: jax.Array
+    cars: ScriptedCars
+    others: ScriptedOthers
+    held_junction: jax.Array
+    held_green: jax.Array
+    brake_s: jax.Array
+    patches: jax.Array
+    steer_noise: jax.Array
+    throttle_noise: jax.Array
+
+
+class ScenarioSlots(struct.PyTreeNode):
+    """The scenarios in play, in H fixed slots; each slot owns rows of `Agents`.
+
+    Attributes:
+      index: (H,) int32, row of the episode's scenarios; -1 for a free slot.
+      triggered_s: (H,) s since the trigger; negative while armed only.
+      has_started: (H, NUM_OTHERS) bool, this actor moves or has moved.
+      moved: (H, NUM_OTHERS) m it has moved.
+      next_index: () int32, the next scenario of the route to be armed.
+      ended_kind: () int32, kind of the scenario that was over in this step, -1 for none.
+      has_timed_out: () bool, that scenario ended by its timeout.
+      has_failed_to_yield: () bool, an emergency vehicle of that scenario was still behind the ego.
+    """
+
+    index: jax.Array
+    triggered_s: jax.Array
+    has_started: jax.Array
+    moved: jax.Array
+    next_index: jax.Array
+    ended_kind: jax.Array
+    has_timed_out: jax.Array
+    has_failed_to_yield: jax.Array
+
+
+def empty_slots(num_slots: int) -> ScenarioSlots:
+    """Slots before the first scenario."""
+    none = jnp.full((), -1, jnp.int32)
+    false = jnp.zeros((), bool)
+    return ScenarioSlots(
+        index=jnp.full(num_slots, -1, jnp.int32),
+        triggered_s=jnp.full(num_slots, -1.0, jnp.float32),
+        has_started=jnp.zeros((num_slots, NUM_OTHERS), bool),
+        moved=jnp.zeros((num_slots, NUM_OTHERS), jnp.float32),
+        next_index=jnp.zeros((), jnp.int32),
+        ended_kind=none,
+        has_timed_out=false,
+        has_failed_to_yield=false,
+    )
+
+
+def nothing(num: int) -> Scenario:
+    """`num` rows of no scenario, NumPy, for the host to fill in and to pad with."""
+
+    def full(value: float, *shape: int, dtype: type = np.float32) -> Any:
+        return np.full((num, *shape), value, dtype)
+
+    cars, others = NUM_CARS, NUM_OTHERS
+    return Scenario(
+        kind=full(-1, dtype=np.int32),
+        arm_s=full(np.inf),
+        trigger_s=full(np.inf),
+        end_s=full(np.inf),
+        timeout_s=full(np.inf),
+        cars=ScriptedCars(
+            model=full(-1, cars, dtype=np.int32),
+            lanes=full(-1, cars, 3, dtype=np.int32),
+            s=full(0, cars),
+            speed=full(0, cars),
+            drive=full(DRIVE_LEGAL, cars, dtype=np.int32),
+            travel=full(np.inf, cars),
+            meet_s=full(0, cars),
+            meet_lane_s=full(0, cars),
+            signals=full(0, cars, dtype=np.int32),
+            from_trigger=full(False, cars, dtype=bool),
+        ),
+        others=ScriptedOthers(
+            kind=full(0, others, dtype=np.int32),
+            xy=full(0, others, 2),
+            yaw=full(0, others),
+            length=full(0, others),
+            width=full(0, others),
+            speed=full(0, others),
+            distance=full(0, others),
+            meet_s=full(0, others),
+            start_time=full(0, others),
+            start_distance=full(0, others),
+            signals=full(0, others, dtype=np.int32),
+        ),
+        held_junction=full(-1, dtype=np.int32),
+        held_green=full(-1, 2, dtype=np.int32),
+        brake_s=full(0),
+        patches=full(0, NUM_PATCHES, 2),
+        steer_noise=full(0),
+        throttle_noise=full(0),
+    )
