@@ -34,11 +34,14 @@ class ScriptedCars(struct.PyTreeNode):
       s: (L,) m on the first of them, where it starts.
       speed: (L,) m/s, at the start and its free speed; 0 leaves it to the limit.
       drive: (L,) int32, DRIVE_*.
-      travel: (L,) m along its way: a DRIVE_FLOW car that has come so far starts again.
+      travel: (L,) m along its way from the beginning of lanes[0]: a DRIVE_FLOW car that has come so
+        far starts again, at `s` and with `speed`.
       meet_s: (L,) m on the route, where its way meets the ego's.
       meet_lane_s: (L,) m along its way from the beginning of lanes[0], the same place.
       signals: (L,) int32, SIGNAL_* bits it always shows.
       from_trigger: (L,) bool, appears and drives at the trigger; else as soon as it is armed.
+      delay: (L,) s after the trigger at which a car with `from_trigger` appears; the cars of a
+        stream leave their source one after another.
     """
 
     model: jax.Array
@@ -51,6 +54,7 @@ class ScriptedCars(struct.PyTreeNode):
     meet_lane_s: jax.Array
     signals: jax.Array
     from_trigger: jax.Array
+    delay: jax.Array
 
 
 class ScriptedOthers(struct.PyTreeNode):
@@ -181,6 +185,7 @@ def nothing(num: int) -> Scenario:
             meet_lane_s=full(0, cars),
             signals=full(0, cars, dtype=np.int32),
             from_trigger=full(False, cars, dtype=bool),
+            delay=full(0, cars),
         ),
         others=ScriptedOthers(
             kind=full(0, others, dtype=np.int32),
