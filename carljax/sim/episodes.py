@@ -1,6 +1,6 @@
 """The bank of episodes: routes and traffic made ahead, drawn from at every reset.
 
-A episode is a route and the traffic at its start. The phase of the lights and every choice that
+An episode is a route and the traffic at its start. The phase of the lights and every choice that
 traffic makes later are drawn anew, so no two episodes on one episode are the same.
 """
 
@@ -15,19 +15,18 @@ import numpy as np
 from flax import struct
 
 from carljax.sim import road_map_builder, route_generator, spawn, traffic
-from carljax.sim import route as route_module
+from carljax.sim.journey import Journey, stack_routes, stack_scenarios
 from carljax.sim.population import Population, no_walkers, nobody
 from carljax.sim.road_map import RoadMap
 from carljax.sim.route import Route
-from carljax.sim.route_generator import RouteSizes
-from carljax.sim.scenarios import script
+from carljax.sim.route_assembly import RouteSizes
 from carljax.sim.scenarios.script import Scenario
 from carljax.sim.town import Town, offsets
 from carljax.sim.types import Agents, Walkers
 
 TRAFFIC_RADIUS = 140.0  # m around the start, where traffic stands at first
 EGO_CLEARANCE = 18.0  # m kept free around the start
-ROUTE_SLACK = 8  # route points beyond one per metre
+_AT_START = 1  # keeps the draws of who is there at the start apart from those of the journey
 
 
 _initial = jax.jit(jax.vmap(traffic.initial, in_axes=(0, 0, 0, None, 0)))
@@ -78,37 +77,75 @@ def make_bank(
     Raises:
       RouteError: a town has no route of that length.
     """
-    sizes = RouteSizes(num_points=max(int(route_length) + ROUTE_SLACK, route_module.WINDOW))
-    found = [spawn.places(town.lanes) for town in towns]
+    journeys = draw_journeys(towns, num_episodes, seed, route_length)
+    return populate(towns, journeys, population, seed)
+
+
+def draw_journeys(towns: Sequence[Town], num: int, seed: int, route_length: float) -> list[Journey]:
+    """Draws routes and what happens on them, town by town in turn.
+
+    Args:
+      towns: at least one.
+      num: how many.
+      seed: see `make_bank`.
+      route_length: m.
+
+    Returns:
+      The journeys, in the tables that the towns share.
+
+    Raises:
+      RouteError: a town has no route of that length.
+    """
+    sizes = RouteSizes(num_points=int(route_length) + 1)
     firsts = offsets(towns)
-    routes, agents = [], []
-    for number in range(num_episodes):
+    journeys = []
+    for number in range(num):
         town = number % len(towns)
         rng = np.random.default_rng([seed, number])
         route = route_generator.draw(towns[town], firsts[town], route_length, sizes, rng)
-        routes.append(route)
-        agents.append(
-            _traffic(
-                towns[town], found[town], firsts[town].lane, route, population.num_traffic, rng
-            )
-        )
+        journeys.append(Journey(route))
+    return journeys
+
+
+def populate(
+    towns: Sequence[Town], journeys: Sequence[Journey], population: Population, seed: int
+) -> EpisodeBank:
+    """Puts journeys and towns on the device and traffic at the start of each journey.
+
+    Args:
+      towns: at least one.
+      journeys: S, in the tables that the towns share.
+      population: how many of each kind of road user there is room for.
+      seed: of who is there at the start.
+
+    Returns:
+      The bank.
+    """
+    found = [spawn.places(town.lanes) for town in towns]
+    firsts = offsets(towns)
+    agents = []
+    for number, journey in enumerate(journeys):
+        town = int(journey.route.town)
+        rng = np.random.default_rng([seed, number, _AT_START])
+        first_lane, most = firsts[town].lane, population.num_traffic
+        agents.append(_traffic(towns[town], found[town], first_lane, journey.route, most, rng))
     lane, s, speed = (np.stack(values) for values in zip(*agents, strict=True))
     road_map = road_map_builder.build(towns)
-    keys = jax.random.split(jax.random.key(seed), num_episodes)
+    num = len(journeys)
     cars = _initial(
         jnp.asarray(lane, jnp.int32),
         jnp.asarray(s, jnp.float32),
         jnp.asarray(speed, jnp.float32),
         road_map,
-        keys,
+        jax.random.split(jax.random.key(seed), num),
     )
-    rest = _repeat(nobody(population.num_agents - population.num_traffic), num_episodes)
+    rest = _repeat(nobody(population.num_agents - population.num_traffic), num)
     return EpisodeBank(
         road_map=road_map,
-        routes=jax.tree.map(lambda *x: jnp.asarray(np.stack(x)), *routes),
+        routes=jax.tree.map(jnp.asarray, stack_routes(journeys)),
         agents=jax.tree.map(lambda *x: jnp.concatenate(x, axis=1), cars, rest),
-        walkers=_repeat(no_walkers(population.num_walkers), num_episodes),
-        scenarios=_repeat(script.nothing(1), num_episodes),
+        walkers=_repeat(no_walkers(population.num_walkers), num),
+        scenarios=jax.tree.map(jnp.asarray, stack_scenarios(journeys)),
     )
 
 
