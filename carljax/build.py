@@ -67,8 +67,8 @@ def setup(config: TrainConfig) -> Setup:
 
 
 def load_towns(maps: Sequence[Path]) -> list[Town]:
-    """Reads the user's maps, or all bundled towns where there are none."""
-    return [town.load(path) for path in maps or [towns.path(name) for name in towns.names()]]
+    """Reads the user's maps, or the bundled towns to train in where there are none."""
+    return [town.load(path) for path in maps or [towns.path(name) for name in towns.TRAINING]]
 
 
 def environment(

@@ -57,6 +57,10 @@ def test_names_and_paths_of_the_bundled_towns() -> None:
     assert all(towns.path(name).stat().st_size < 400_000 for name in TOWNS)
 
 
+def test_each_town_is_either_for_training_or_kept_for_scoring() -> None:
+    assert sorted(towns.TRAINING + towns.HELD_OUT) == list(towns.names())
+
+
 def test_an_unknown_town_is_refused_with_the_names_that_exist() -> None:
     with pytest.raises(ValueError, match="'gird'; there are: grid, highway, village"):
         towns.path("gird")

@@ -96,7 +96,7 @@ def assemble(town: Town, first: Offsets, segments: Sequence[Segment]) -> Route:
     return Route(**{name: _narrow(value) for name, value in fields.items()})
 
 
-def _narrow(values: np.ndarray) -> np.ndarray:
+def _narrow(values: np.ndarray) -> Any:
     """The same in the types of the device."""
     return values.astype({"f": np.float32, "i": np.int32, "b": bool}[values.dtype.kind])
 

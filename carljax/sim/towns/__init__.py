@@ -5,6 +5,10 @@ from __future__ import annotations
 import pathlib
 from importlib import resources
 
+# Which of the bundled towns a policy may learn in, and which are kept for scoring.
+TRAINING = ("grid", "highway", "village")
+HELD_OUT: tuple[str, ...] = ()
+
 
 def names() -> tuple[str, ...]:
     """The names of the bundled towns, in alphabetical order."""
