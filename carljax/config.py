@@ -43,7 +43,7 @@ class RunConfig:
         tyro.conf.UseAppendAction,
         tyro.conf.arg(name="map", prefix_name=False, metavar="FILE.xodr"),
     ] = ()
-    """OpenDRIVE file to train and be scored in; repeatable. None: the bundled towns that aren't kept for scoring."""
+    """OpenDRIVE file to train and be scored in; repeatable. None: the bundled towns for training."""
     num_routes: int = 512
     """Training routes drawn ahead from the seed, over all towns."""
     num_devices: int | None = None
