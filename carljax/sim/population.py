@@ -83,6 +83,7 @@ def nobody(num: int) -> Agents:
         wait_s=zeros,
         lateral=zeros,
         from_lane=jnp.full(num, -1, jnp.int32),
+        from_s=zeros,
         cruise_speed=zeros,
         is_lawless=false,
         is_braking_hard=false,

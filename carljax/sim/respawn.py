@@ -5,7 +5,7 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 
-from carljax.sim import geometry, traffic
+from carljax.sim import geometry, traffic, vehicles
 from carljax.sim.right_of_way import BRAKING, planned_lane
 from carljax.sim.road_map import RoadMap, pose_at
 from carljax.sim.types import Agents, EgoState
@@ -34,9 +34,9 @@ def respawn(
       cell_size: m, of the respawn grid.
 
     Returns:
-      The agents; the moved one has a new plan and the speed of its lane.
+      The agents; the moved one is another vehicle, with a new plan and the speed of its lane.
     """
-    key_place, key_plan = jax.random.split(key)
+    key_place, key_plan, key_model = jax.random.split(key, 3)
     lane, s = _respawn_place(ego, town, road_map, key_place, cell_size)
     pose = pose_at(road_map, jnp.maximum(lane, 0), s)
     seen = geometry.to_frame(pose.xy, ego.xy, ego.yaw)
@@ -52,20 +52,28 @@ def respawn(
     gone = agents.valid & ((away > GONE**2) | (ended & unseen))
     chosen = jnp.argmax(jnp.where(gone, away + 1.0, 0.0))
     moves = (jnp.arange(gone.shape[0]) == chosen) & gone & hidden & clear & (lane >= 0)
-    lanes = traffic.plan(jnp.maximum(lane, 0)[None], road_map, key_plan)
+    one = jnp.maximum(lane, 0)[None]
+    model, length, width = vehicles.draw(one, jnp.float32([SPAWN_GAP]), road_map, key_model)
+    lanes = traffic.plan(one, model, road_map, key_plan)
     limit = jnp.minimum(
         road_map.lane_speed_limit[lanes[0, 0]], road_map.lane_curve_speed[lanes[0, 0]]
     )
     # No faster than can be stopped within the gap that was checked.
     speed = jnp.minimum(0.8 * limit, jnp.sqrt(2 * BRAKING * (SPAWN_GAP - 6.0)))
+    speed = jnp.minimum(speed, vehicles.speed_cap(model[0]))
     return traffic.place(
         agents.replace(
+            model=jnp.where(moves, model, agents.model),
+            length=jnp.where(moves, length, agents.length),
+            width=jnp.where(moves, width, agents.width),
             lanes=jnp.where(moves[:, None], lanes, agents.lanes),
             lane_s=jnp.where(moves, s, agents.lane_s),
             speed=jnp.where(moves, speed, agents.speed),
             accel=jnp.where(moves, 0.0, agents.accel),
             wait_s=jnp.where(moves, 0.0, agents.wait_s),
             has_stopped=agents.has_stopped & ~moves,
+            lateral=jnp.where(moves, 0.0, agents.lateral),
+            from_lane=jnp.where(moves, -1, agents.from_lane),
         ),
         road_map,
     )

@@ -11,7 +11,7 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 
-from carljax.sim import geometry, idm, population
+from carljax.sim import geometry, idm, population, vehicles
 from carljax.sim.idm import IDMParams
 from carljax.sim.right_of_way import (
     BRAKING,
@@ -168,7 +168,7 @@ def _follow_plan(agents: Agents, road_map: RoadMap, key: jax.Array) -> Agents:
     for key_choice in keys:  # twice: very short lanes are passed within one step
         length = road_map.lane_length[planned_lane(agents, 0)]
         over = (agents.lane_s > length) & (agents.lanes[:, 1] >= 0)
-        drawn = next_lane(agents.lanes[:, 2], road_map, key_choice)
+        drawn = next_lane(agents.lanes[:, 2], agents.model, road_map, key_choice)
         onward = jnp.stack([agents.lanes[:, 1], agents.lanes[:, 2], drawn], axis=1)
         agents = agents.replace(
             lanes=jnp.where(over[:, None], onward, agents.lanes),
@@ -177,20 +177,32 @@ def _follow_plan(agents: Agents, road_map: RoadMap, key: jax.Array) -> Agents:
     return agents
 
 
-def next_lane(lane: jax.Array, road_map: RoadMap, key: jax.Array) -> jax.Array:
-    """(N,) int32, a successor of each lane drawn uniformly; -1 after a dead end."""
-    successors = road_map.lane_successors[jnp.maximum(lane, 0)]
-    count = (successors >= 0).sum(axis=1)
-    drawn = jax.random.randint(key, lane.shape, 0, 1 << 16) % jnp.maximum(count, 1)
+def next_lane(lane: jax.Array, model: jax.Array, road_map: RoadMap, key: jax.Array) -> jax.Array:
+    """(N,) int32, a successor of each lane drawn uniformly from those that suit; -1 at dead ends.
+
+    Args:
+      lane: (N,) int32, -1 for none.
+      model: (N,) int32, class of the vehicle that will drive there.
+      road_map: the map.
+      key: PRNG key.
+    """
+    successors = road_map.lane_successors[jnp.maximum(lane, 0)]  # (N, F)
+    there = successors >= 0
+    suited = there & vehicles.suits(model[:, None], jnp.maximum(successors, 0), road_map)
+    open_to = jnp.where(suited.any(axis=1, keepdims=True), suited, there)
+    number = jnp.cumsum(open_to, axis=1)  # of each, from 1
+    drawn = jax.random.uniform(key, lane.shape) * number[:, -1]
+    drawn = jnp.argmax(open_to & (number > drawn[:, None]), axis=1)
     chosen = jnp.take_along_axis(successors, drawn[:, None], axis=1)[:, 0]
-    return jnp.where((lane >= 0) & (count > 0), chosen, -1)
+    return jnp.where(lane >= 0, chosen, -1)
 
 
-def plan(lane: jax.Array, road_map: RoadMap, key: jax.Array) -> jax.Array:
+def plan(lane: jax.Array, model: jax.Array, road_map: RoadMap, key: jax.Array) -> jax.Array:
     """(N, 3) int32, a plan that begins with the given lanes."""
     key_second, key_third = jax.random.split(key)
-    second = next_lane(lane, road_map, key_second)
-    return jnp.stack([lane, second, next_lane(second, road_map, key_third)], axis=1)
+    second = next_lane(lane, model, road_map, key_second)
+    third = next_lane(second, model, road_map, key_third)
+    return jnp.stack([lane, second, third], axis=1)
 
 
 def initial(
@@ -208,19 +220,24 @@ def initial(
     Returns:
       The agents, placed.
     """
-    key_plan, key_size, key_temper = jax.random.split(key, 3)
+    key_plan, key_model, key_temper = jax.random.split(key, 3)
     num = lane.shape[0]
-    size = jax.random.uniform(key_size, (num, 2))
-    temper = jax.random.uniform(key_temper, (num,), minval=0.7, maxval=1.1)
+    model, length, width = vehicles.draw(lane, _room(lane, s), road_map, key_model)
     agents = population.nobody(num).replace(
-        speed=jnp.where(lane >= 0, speed, 0.0),
-        # From a small car to a van. source: spread of CARLA's car blueprints, 3.6 to 5.4 m by 1.8
-        # to 2.2 m
-        length=3.6 + 1.8 * size[:, 0],
-        width=1.8 + 0.4 * size[:, 1],
+        speed=jnp.where(lane >= 0, jnp.minimum(speed, vehicles.speed_cap(model)), 0.0),
+        length=length,
+        width=width,
         kind=jnp.where(lane >= 0, KIND_VEHICLE, 0).astype(jnp.int32),
-        lanes=plan(lane, road_map, key_plan),
+        model=model,
+        lanes=plan(lane, model, road_map, key_plan),
         lane_s=s,
-        desired_speed_frac=temper,
+        desired_speed_frac=jax.random.uniform(key_temper, (num,), minval=0.7, maxval=1.1),
     )
     return place(agents, road_map)
+
+
+def _room(lane: jax.Array, s: jax.Array) -> jax.Array:
+    """(N,) m, length of vehicles that leave a metre between one another on each lane."""
+    away = jnp.abs(s[:, None] - s[None, :])
+    same = (lane[:, None] == lane[None, :]) & ~jnp.eye(lane.shape[0], dtype=bool)
+    return jnp.where(same, away, FAR).min(axis=1) - 1.0

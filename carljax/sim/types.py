@@ -79,6 +79,7 @@ class Agents(struct.PyTreeNode):
       lateral: (N,) m, offset from the lane's centre, positive to its left; a lane change brings it
         to 0.
       from_lane: (N,) int32, the lane that it still leaves during a lane change, else -1.
+      from_s: (N,) m, arc length on that lane.
       cruise_speed: (N,) m/s, free speed that a scenario asks for; 0 leaves it to limit and temper.
       is_lawless: (N,) bool, a scenario's driver, who minds neither lights, signs, right of way nor
         the ego, only the cars ahead in its lane.
@@ -103,6 +104,7 @@ class Agents(struct.PyTreeNode):
     wait_s: jax.Array
     lateral: jax.Array
     from_lane: jax.Array
+    from_s: jax.Array
     cruise_speed: jax.Array
     is_lawless: jax.Array
     is_braking_hard: jax.Array
