@@ -17,6 +17,9 @@ LAYER_ROAD, LAYER_SHOULDER, LAYER_MARK_SOLID, LAYER_MARK_BROKEN, LAYER_JUNCTION,
     16,
     32,
 )
+# Values of `RoadMap.walk_kind`: along pavements, over a crosswalk, over the road where there is
+# none, and from a pavement to the kerb before either.
+WALK_PAVEMENT, WALK_CROSSING, WALK_JAYWALK, WALK_TO_CROSSING, WALK_TO_JAYWALK = 0, 1, 2, 3, 4
 
 
 class RoadMap(struct.PyTreeNode):
@@ -45,6 +48,8 @@ class RoadMap(struct.PyTreeNode):
       lane_town: (K,) int32.
       point_xy: (P, 2) m; point_z: (P,) m; point_yaw: (P,) rad; point_width: (P,) m.
       point_lane: (P,) int32.
+      point_left, point_right: (P,) int32, the point of the lane beside to which traffic may change;
+        -1 where there is none, in junctions and across solid lines.
       light_cycle: (L,) s, period of the junction's programme.
       light_start: (L,) s, when within it this light turns green.
       light_junction: (L,) int32, running index of its junction, -1 for a light on the open road.
@@ -77,6 +82,8 @@ class RoadMap(struct.PyTreeNode):
     point_yaw: jax.Array
     point_width: jax.Array
     point_lane: jax.Array
+    point_left: jax.Array
+    point_right: jax.Array
     light_cycle: jax.Array
     light_start: jax.Array
     light_junction: jax.Array

@@ -73,6 +73,8 @@ def _lane_arrays(towns: Sequence[Town]) -> dict[str, np.ndarray]:
             "point_yaw": table.point_yaw,
             "point_width": table.point_width,
             "point_lane": table.point_lane + first.lane,
+            "point_left": _shift(town.neighbours.left, first.point),
+            "point_right": _shift(town.neighbours.right, first.point),
             "light_cycle": light.cycle,
             "light_start": light.start,
             "light_junction": _shift(light.junction, first.junction),

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from carljax.sim import junctions, lane_table, light_table, opendrive
+from carljax.sim import junctions, lane_neighbours, lane_table, light_table, opendrive
 from carljax.sim.road_network import MapError, RoadNetwork
 
 
@@ -19,12 +19,13 @@ class Town:
     Attributes:
       network: as read, moved so that its middle lies near (0, 0).
       offset: (2,) float64, what was subtracted from the file's coordinates, m.
-      lanes, junctions, lights: its tables.
+      lanes, neighbours, junctions, lights: its tables.
     """
 
     network: RoadNetwork
     offset: np.ndarray
     lanes: lane_table.LaneTable
+    neighbours: lane_neighbours.Neighbours
     junctions: junctions.JunctionTable
     lights: light_table.LightTable
 
@@ -85,6 +86,7 @@ def from_network(network: RoadNetwork) -> Town:
         network=network,
         offset=offset,
         lanes=table,
+        neighbours=lane_neighbours.build(network, table),
         junctions=junctions.build(network, table),
         lights=light_table.build(network, table),
     )
