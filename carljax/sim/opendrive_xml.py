@@ -81,17 +81,17 @@ def _read(path: pathlib.Path, place: Place) -> bytes:
     return data
 
 
-def parse(path: pathlib.Path, place: Place) -> ET.Element:
-    """The root element of an OpenDRIVE file.
+def parse(path: pathlib.Path, place: Place, root_tag: str = "OpenDRIVE") -> ET.Element:
+    """The root element of an XML file.
 
     Raises:
-      MapError: unreadable, not XML, not OpenDRIVE, or with XML entities of its own (which can blow
-        a small file up to gigabytes; OpenDRIVE has no use for them).
+      MapError: unreadable, not XML, another root element, or with XML entities of its own (which
+        can blow a small file up to gigabytes; the files read here have no use for them).
     """
     data = _read(path, place)
 
     def refuse(name: str, *_: object) -> None:
-        raise place.error(f"declares the XML entity {shown(name)}; OpenDRIVE files have none")
+        raise place.error(f"declares the XML entity {shown(name)}; {root_tag} files have none")
 
     scan = expat.ParserCreate()
     scan.EntityDeclHandler = refuse
@@ -107,8 +107,8 @@ def parse(path: pathlib.Path, place: Place) -> ET.Element:
     for element in root.iter():  # drop the namespaces that some exporters declare
         if isinstance(element.tag, str) and element.tag.startswith("{"):
             element.tag = element.tag.partition("}")[2]
-    if root.tag != "OpenDRIVE":
-        raise place.error(f"is not OpenDRIVE: the root element is {shown(str(root.tag))}")
+    if root.tag != root_tag:
+        raise place.error(f"is not {root_tag}: the root element is {shown(str(root.tag))}")
     return root
 
 
