@@ -16,17 +16,19 @@ FREE, CONFLICT, CONFLICT_YIELD, CONFLICT_PRIORITY = 0, 1, 2, 3
 CLEARANCE = (
     2.6  # m between lane centres at which two cars can't pass. source: ours, car width + 0.7 m
 )
+ONCOMING = -0.7  # cosine of the angle between the ways in of oncoming traffic. source: ours, 45 deg
 TURN_YAW = np.deg2rad(35.0)  # beyond it a lane turns. source: CaRL's route generator, command rule
 
 
 @dataclasses.dataclass(frozen=True)
 class JunctionTable:
-    """Fields as in `RoadMap`: junction (K,), slot (K,), conflict (K, J), fork (K,)."""
+    """Fields as in `RoadMap`: junction (K,), slot (K,), conflict (K, J), fork, yield_s (K,)."""
 
     junction: np.ndarray
     slot: np.ndarray
     conflict: np.ndarray
     fork: np.ndarray
+    yield_s: np.ndarray
 
 
 def build(network: RoadNetwork, table: LaneTable) -> JunctionTable:
@@ -43,6 +45,7 @@ def build(network: RoadNetwork, table: LaneTable) -> JunctionTable:
     members = [np.flatnonzero(junction == i) for i in range(len(ids))]
     size = max([len(m) for m in members], default=1)
     conflict = np.zeros((num_lanes, max(size, 1)), np.uint8)
+    yield_s = np.full(num_lanes, np.inf)
     for name, i in ids.items():
         rows = members[i]
         slot[rows] = np.arange(len(rows))
@@ -51,7 +54,9 @@ def build(network: RoadNetwork, table: LaneTable) -> JunctionTable:
             for b in rows.tolist():
                 if a != b and fork[a] != fork[b] and _meet(table, a, b):
                     conflict[a, slot[b]] = _owes(network, table, a, b, priority)
-    return JunctionTable(junction, slot, conflict, fork)
+                    if _waits_for(table, a, b, int(conflict[a, slot[b]])):
+                        yield_s[a] = min(yield_s[a], _meeting_s(table, a, b))
+    return JunctionTable(junction, slot, conflict, fork, yield_s)
 
 
 def junction_ids(table: LaneTable) -> dict[str, int]:
@@ -67,10 +72,30 @@ def _forks(table: LaneTable) -> np.ndarray:
 
 
 def _meet(table: LaneTable, a: int, b: int) -> bool:
+    return bool(_near(table, a, b).any())
+
+
+def _near(table: LaneTable, a: int, b: int) -> np.ndarray:
+    """Points of lane a, bool, at which two cars on the lanes can't pass."""
     xyz_a, xyz_b = table.point_xyz[table.points(a)], table.point_xyz[table.points(b)]
     gap = np.hypot(*(xyz_a[:, None, :2] - xyz_b[None, :, :2]).transpose(2, 0, 1))
     level = np.abs(xyz_a[:, None, 2] - xyz_b[None, :, 2]) < 3.0
-    return bool(((gap < CLEARANCE) & level).any())
+    return ((gap < CLEARANCE) & level).any(axis=1)
+
+
+def _meeting_s(table: LaneTable, a: int, b: int) -> float:
+    """Arc length on lane a where it first comes too near to lane b, m."""
+    return float(np.argmax(_near(table, a, b)) * table.length[a] / (table.num_points[a] - 1))
+
+
+def _waits_for(table: LaneTable, a: int, b: int, owes: int) -> bool:
+    """Whether lane a has to mind lane b; behind lights only oncoming lanes are green as well."""
+    if owes not in (CONFLICT, CONFLICT_YIELD):
+        return False
+    if table.stop_kind[a] != STOP_LIGHT:
+        return True
+    yaw_a, yaw_b = (table.point_yaw[table.start[lane]] for lane in (a, b))
+    return owes == CONFLICT_YIELD and np.cos(yaw_a - yaw_b) < ONCOMING
 
 
 def turn(table: LaneTable, lane: int) -> float:

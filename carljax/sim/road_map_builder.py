@@ -9,8 +9,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from carljax.sim import atlas, spawn
-from carljax.sim.road_map import PIXELS_PER_METRE, RoadMap
+from carljax.sim import atlas, spawn, walk_graph
+from carljax.sim.road_map import PIXELS_PER_METRE, WALK_PAVEMENT, RoadMap
 from carljax.sim.town import Town, offsets
 
 
@@ -24,9 +24,8 @@ def build(towns: Sequence[Town], seed: int = 0) -> RoadMap:
     Returns:
       The map; `town.offsets(towns)` tells where the rows of each town begin.
     """
-    lanes = _lane_arrays(towns)
-    atlases = _atlases(towns, seed)
-    return RoadMap(**{name: _on_device(value) for name, value in {**lanes, **atlases}.items()})
+    arrays = {**_lane_arrays(towns), **_walk_arrays(towns), **_atlases(towns, seed)}
+    return RoadMap(**{name: _on_device(value) for name, value in arrays.items()})
 
 
 def _on_device(value: np.ndarray) -> jax.Array:
@@ -64,6 +63,7 @@ def _lane_arrays(towns: Sequence[Town]) -> dict[str, np.ndarray]:
             "lane_slot": cross.slot,
             "lane_conflict": _widen(cross.conflict, slots, 0),
             "lane_fork": fork,
+            "lane_yield_s": cross.yield_s,
             "lane_stop_s": table.stop_s,
             "lane_stop_kind": table.stop_kind,
             "lane_light": _shift(light.lane_light, first.light),
@@ -84,21 +84,45 @@ def _lane_arrays(towns: Sequence[Town]) -> dict[str, np.ndarray]:
     return {name: np.concatenate(values) for name, values in rows.items()}
 
 
+def _walk_arrays(towns: Sequence[Town]) -> dict[str, np.ndarray]:
+    """Walk graphs, one after another and then one node without edges, so that there is a row."""
+    most = max(t.walks.neighbours.shape[1] for t in towns)
+    rows: dict[str, list[np.ndarray]] = {}
+    for town, first in zip(towns, offsets(towns), strict=True):
+        graph = town.walks
+        arrays = {
+            "walk_xy": graph.xy,
+            "walk_z": graph.z,
+            "walk_neighbours": _widen(_shift(graph.neighbours, first.walk), most, -1),
+            "walk_yaw": _widen(graph.yaw, most, 0),
+            "walk_kind": _widen(graph.kind, most, WALK_PAVEMENT),
+        }
+        for name, value in arrays.items():
+            rows.setdefault(name, []).append(value)
+    nobody = {name: np.zeros((1, *values[0].shape[1:])) for name, values in rows.items()}
+    nobody["walk_neighbours"] -= 1.0
+    return {
+        name: np.concatenate([*values, nobody[name].astype(values[0].dtype)])
+        for name, values in rows.items()
+    }
+
+
 def _atlases(towns: Sequence[Town], seed: int) -> dict[str, np.ndarray]:
     """Pixel atlases and respawn tables, all towns padded to the largest."""
     frames = [atlas.frame(t.network) for t in towns]
     shape = (max(f[1][0] for f in frames), max(f[1][1] for f in frames))
     extent = (shape[1] / PIXELS_PER_METRE, shape[0] / PIXELS_PER_METRE)
-    out: dict[str, list[np.ndarray]] = {
-        name: [] for name in ("layers", "nearest_point", "origin", "spawn_lane", "spawn_s")
-    }
+    names = ("layers", "nearest_point", "origin", "spawn_lane", "spawn_s", "spawn_walk")
+    out: dict[str, list[np.ndarray]] = {name: [] for name in names}
     for town, first, (origin, _) in zip(towns, offsets(towns), frames, strict=True):
         table = town.lanes
         nearest = atlas.nearest_point(table.point_xyz[:, :2], origin, shape)
         lane, s = spawn.respawn_table(spawn.places(table), origin, extent, seed)
+        walk = walk_graph.respawn_table(town.walks, origin, extent, seed)
         out["layers"].append(atlas.layers(town.network, origin, shape))
         out["nearest_point"].append(_shift(np.asarray(nearest), first.point))
         out["origin"].append(origin)
         out["spawn_lane"].append(_shift(lane, first.lane))
         out["spawn_s"].append(s)
+        out["spawn_walk"].append(_shift(walk, first.walk))
     return {name: np.stack(values) for name, values in out.items()}

@@ -159,6 +159,30 @@ def test_lanes_conflict_where_two_cars_cannot_pass(apart, code):
     assert junctions.build(net, lane_table.build(net)).conflict[0, 1] == code
 
 
+def yield_s(net, way):
+    table = lane_table.build(net)
+    return junctions.build(net, table).yield_s[table.raw_lane[inner("west", way)]]
+
+
+def test_a_lane_is_clear_up_to_the_first_lane_it_has_to_mind():
+    # Straight on from the west reaches 2.6 m before the lane from the north, at x = -1.75, after
+    # 10 - 1.75 - 2.6 = 5.65 m; its points lie at whole metres.
+    assert yield_s(crossing(), "straight") == 6.0
+    # A left turn comes near the oncoming lane, at y = 1.75, where 10 - 11.75 cos t = 1.75 - 2.6:
+    # t = 0.394, after 4.63 m; it is 18.46 m long in 19 pieces of 0.971 m.
+    assert yield_s(crossing(), "left") == pytest.approx(5 * 18.4568 / 19, abs=1e-3)
+
+
+def test_behind_lights_only_a_turn_across_oncoming_traffic_has_to_mind_anybody():
+    lights = crossing(dict.fromkeys(ARMS, "light"), [("east", "west"), ("north", "south")])
+    assert yield_s(lights, "left") == pytest.approx(5 * 18.4568 / 19, abs=1e-3)
+    assert yield_s(lights, "straight") == np.inf and yield_s(lights, "right") == np.inf
+
+
+def test_whoever_has_priority_has_to_mind_nobody():
+    assert yield_s(crossing({"north": "stop", "south": "stop"}), "straight") == np.inf
+
+
 def test_lanes_of_different_junctions_never_conflict():
     lanes = [
         straight((-10, 0), (10, 0), junction="9"),
