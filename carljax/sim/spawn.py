@@ -47,7 +47,11 @@ def places(table: LaneTable) -> Places:
 
 
 def respawn_table(
-    found: Places, origin: np.ndarray, extent: tuple[float, float], seed: int
+    found: Places,
+    origin: np.ndarray,
+    extent: tuple[float, float],
+    seed: int,
+    ring: tuple[float, float] = RING,
 ) -> tuple[np.ndarray, np.ndarray]:
     """For each grid cell the ego may be in, places in a ring around it.
 
@@ -57,6 +61,7 @@ def respawn_table(
       extent: width and height of the grid, m.
       seed: of the choice where a ring holds more than `CANDIDATES` places; each cell chooses by
         itself, so that a larger grid changes nothing.
+      ring: least and greatest distance from the cell's centre, m.
 
     Returns:
       lane (Gy, Gx, C) int, -1 pads; s (Gy, Gx, C) m.
@@ -70,10 +75,10 @@ def respawn_table(
     for row in range(rows):
         for column in range(columns):
             centre = origin + CELL * (np.array([column, row]) + 0.5)
-            near = np.array(tree.query_ball_point(centre, RING[1]), int)
+            near = np.array(tree.query_ball_point(centre, ring[1]), int)
             if len(near) == 0:
                 continue
-            near = near[np.hypot(*(found.xy[near] - centre).T) > RING[0]]
+            near = near[np.hypot(*(found.xy[near] - centre).T) > ring[0]]
             near = np.random.default_rng([seed, row, column]).permutation(near)[:CANDIDATES]
             lane[row, column, : len(near)] = found.lane[near]
             s[row, column, : len(near)] = found.s[near]

@@ -8,7 +8,14 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from carljax.sim import junctions, lane_neighbours, lane_table, light_table, opendrive
+from carljax.sim import (
+    junctions,
+    lane_neighbours,
+    lane_table,
+    light_table,
+    opendrive,
+    walk_graph,
+)
 from carljax.sim.road_network import MapError, RoadNetwork
 
 
@@ -20,6 +27,7 @@ class Town:
       network: as read, moved so that its middle lies near (0, 0).
       offset: (2,) float64, what was subtracted from the file's coordinates, m.
       lanes, neighbours, junctions, lights: its tables.
+      walks: where pedestrians walk.
     """
 
     network: RoadNetwork
@@ -28,6 +36,7 @@ class Town:
     neighbours: lane_neighbours.Neighbours
     junctions: junctions.JunctionTable
     lights: light_table.LightTable
+    walks: walk_graph.WalkGraph
 
 
 @dataclasses.dataclass(frozen=True)
@@ -36,7 +45,7 @@ class Offsets:
 
     Attributes:
       town: its index.
-      lane, point, light, junction: first rows.
+      lane, point, light, junction, walk: first rows.
     """
 
     town: int
@@ -44,11 +53,12 @@ class Offsets:
     point: int
     light: int
     junction: int
+    walk: int
 
 
 def offsets(towns: Sequence[Town]) -> list[Offsets]:
     """First rows of each town in the shared tables."""
-    out = [Offsets(0, 0, 0, 0, 0)]
+    out = [Offsets(0, 0, 0, 0, 0, 0)]
     for town in towns:
         last = out[-1]
         out.append(
@@ -58,6 +68,7 @@ def offsets(towns: Sequence[Town]) -> list[Offsets]:
                 point=last.point + len(town.lanes.point_yaw),
                 light=last.light + len(town.lights.cycle),
                 junction=last.junction + int(town.junctions.junction.max(initial=-1)) + 1,
+                walk=last.walk + len(town.walks.z),
             )
         )
     return out[:-1]
@@ -89,6 +100,7 @@ def from_network(network: RoadNetwork) -> Town:
         neighbours=lane_neighbours.build(network, table),
         junctions=junctions.build(network, table),
         lights=light_table.build(network, table),
+        walks=walk_graph.build(network, table),
     )
 
 

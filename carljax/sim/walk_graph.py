@@ -13,6 +13,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
+from carljax.sim import spawn
 from carljax.sim.lane_table import LaneTable
 from carljax.sim.road_map import (
     WALK_CROSSING,
@@ -27,6 +28,7 @@ from carljax.sim.walk_ways import Pavements, Road, Strip, Way, ways
 SPACING = 3.0  # m between nodes: chords stay within 0.3 m of a corner of 4 m radius
 SAME = 0.6  # m, nodes closer than this are one
 JOIN = 3.0  # m, gaps between the ends of pavements that are stepped over
+RING = (66.0, 115.0)  # m from a cell's centre, where people appear: just out of CaRL's image
 KERB_MARGIN = 0.6  # m from the pavement's edge to where people wait
 
 
@@ -83,6 +85,25 @@ def build(network: RoadNetwork, table: LaneTable) -> WalkGraph:
         _across(draft, way, first, second, pavements)
     xyz = np.array(draft.xyz)
     return _table(xyz, road.height(xyz), draft.edges, num_pavement)
+
+
+def respawn_table(
+    graph: WalkGraph, origin: np.ndarray, extent: tuple[float, float], seed: int
+) -> np.ndarray:
+    """For each grid cell the ego may be in, nodes on pavements in a ring around it.
+
+    Args:
+      graph: the town's.
+      origin: (2,) lower left corner of the grid, m.
+      extent: width and height of the grid, m.
+      seed: of the choice where a ring holds more nodes than there is room for.
+
+    Returns:
+      (Gy, Gx, C) int, -1 pads.
+    """
+    nodes = np.flatnonzero(~graph.is_kerb)
+    places = spawn.Places(nodes, np.zeros(len(nodes)), graph.xy[nodes])
+    return spawn.respawn_table(places, origin, extent, seed, RING)[0]
 
 
 def _along(strips: list[Strip], across: list[Way]) -> tuple[_Draft, list[tuple[int, int]]]:
