@@ -168,13 +168,15 @@ def test_a_lane_is_clear_up_to_the_first_lane_it_has_to_mind():
     # Straight on from the west reaches 2.6 m before the lane from the north, at x = -1.75, after
     # 10 - 1.75 - 2.6 = 5.65 m; its points lie at whole metres.
     assert yield_s(crossing(), "straight") == 6.0
-    # A left turn comes near the oncoming lane, at y = 1.75, where 10 - 11.75 cos t = 1.75 - 2.6:
-    # t = 0.394, after 4.63 m; it is 18.46 m long in 19 pieces of 0.971 m.
-    assert yield_s(crossing(), "left") == pytest.approx(5 * 18.4568 / 19, abs=1e-3)
+    # A left turn runs on a circle of 11.75 m around (-10, 10) and meets first the one from the
+    # south, around (-10, -10). They are 2.6 m apart where 11.75^2 + 20^2 - 2 * 20 * 11.75 cos t =
+    # 9.15^2: t = 0.2587, after 3.04 m; it is 18.46 m long in 19 pieces of 0.971 m.
+    assert yield_s(crossing(), "left") == pytest.approx(4 * 18.4568 / 19, abs=1e-3)
 
 
 def test_behind_lights_only_a_turn_across_oncoming_traffic_has_to_mind_anybody():
     lights = crossing(dict.fromkeys(ARMS, "light"), [("east", "west"), ("north", "south")])
+    # The oncoming lane lies at y = 1.75: 10 - 11.75 cos t = 1.75 - 2.6, t = 0.394, after 4.63 m.
     assert yield_s(lights, "left") == pytest.approx(5 * 18.4568 / 19, abs=1e-3)
     assert yield_s(lights, "straight") == np.inf and yield_s(lights, "right") == np.inf
 
