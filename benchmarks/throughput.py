@@ -31,7 +31,7 @@ from carljax.ppo.types import Minibatch, TrainState
 from carljax.ppo.update import update
 from carljax.sim import episodes
 from carljax.sim.env import DrivingEnv, make_env
-from carljax.sim.rasterizer import RasterConfig
+from carljax.sim.raster_canvas import RasterConfig
 from carljax.sim.town import Town
 from carljax.sim.types import State
 

@@ -9,7 +9,7 @@ import jax
 from carljax.config import RunConfig, TrainConfig
 from carljax.ppo.config import NetworkConfig, PPOConfig
 from carljax.sim.env import EnvConfig
-from carljax.sim.rasterizer import RasterConfig
+from carljax.sim.raster_canvas import RasterConfig
 
 
 @dataclasses.dataclass(frozen=True)

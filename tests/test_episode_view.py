@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from carljax.render import episode_view
-from carljax.sim.rasterizer import CHANNELS, RasterConfig
+from carljax.sim.raster_canvas import CHANNELS, RasterConfig
 
 
 @pytest.mark.parametrize(

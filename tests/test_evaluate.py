@@ -23,7 +23,7 @@ from carljax.reward import reward
 from carljax.reward.config import RewardConfig
 from carljax.sim import towns
 from carljax.sim.env import EnvConfig
-from carljax.sim.rasterizer import RasterConfig
+from carljax.sim.raster_canvas import RasterConfig
 from carljax.sim.types import KIND_VEHICLE
 
 NUM_ROUTES = 3

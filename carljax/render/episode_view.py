@@ -17,7 +17,7 @@ from carljax.render import image
 from carljax.reward.reward import SOFT_FACTORS
 from carljax.sim import lights
 from carljax.sim.env import DrivingEnv
-from carljax.sim.rasterizer import RasterConfig
+from carljax.sim.raster_canvas import RasterConfig
 from carljax.sim.road_map import PIXELS_PER_METRE, RoadMap
 from carljax.sim.types import (
     KIND_PEDESTRIAN,

@@ -5,7 +5,9 @@ from __future__ import annotations
 import jax
 import numpy as np
 
-from carljax.sim.rasterizer import BRAKE_LIGHT_VALUE, CHANNELS, GREEN_VALUE, RasterConfig
+from carljax.sim.raster_canvas import CHANNELS, RasterConfig
+from carljax.sim.raster_road import GREEN_VALUE
+from carljax.sim.raster_users import LIGHTS
 from carljax.sim.road_map import (
     LAYER_JUNCTION,
     LAYER_MARK_BROKEN,
@@ -14,6 +16,7 @@ from carljax.sim.road_map import (
     LAYER_ROAD,
     LAYER_SHOULDER,
 )
+from carljax.sim.types import SIGNAL_BRAKE, SIGNAL_EMERGENCY, SIGNAL_LEFT, SIGNAL_RIGHT
 
 Colour = tuple[int, int, int]
 
@@ -29,7 +32,12 @@ BROKEN: Colour = (164, 92, 128)
 VEHICLE: tuple[Colour, Colour] = ((38, 92, 190), (150, 226, 255))
 PEDESTRIAN: tuple[Colour, Colour] = ((236, 150, 40), (255, 236, 120))
 SPEED_SIGN: tuple[Colour, Colour] = ((122, 80, 190), (216, 190, 255))
-BRAKE_LIGHT: Colour = (255, 84, 56)
+VEHICLE_LIGHT: dict[int, Colour] = {
+    SIGNAL_BRAKE: (255, 84, 56),
+    SIGNAL_EMERGENCY: (96, 96, 255),
+    SIGNAL_LEFT: (255, 178, 40),
+    SIGNAL_RIGHT: (255, 178, 41),
+}
 STATIC: Colour = (158, 116, 78)
 STOP_SIGN: Colour = (198, 44, 64)
 GREEN: Colour = (52, 208, 104)
@@ -81,7 +89,8 @@ def bev_image(
     picture[light == 255] = RED
     picture[channel["static"] > 0] = STATIC
     _paint_scale(picture, channel["vehicles"], VEHICLE)
-    picture[channel["vehicles"] == BRAKE_LIGHT_VALUE] = BRAKE_LIGHT
+    for bit, (value, _, _) in LIGHTS.items():
+        picture[channel["vehicles"] == value] = VEHICLE_LIGHT[bit]
     _paint_scale(picture, channel["pedestrians"], PEDESTRIAN)
     picture = picture.repeat(scale, axis=0).repeat(scale, axis=1)
     _paint_ego(picture, config, scale, ego_size)

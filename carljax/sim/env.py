@@ -21,7 +21,7 @@ from carljax.sim.episodes import EpisodeBank
 from carljax.sim.idm import IDMParams
 from carljax.sim.observation import observe
 from carljax.sim.population import Population
-from carljax.sim.rasterizer import RasterConfig
+from carljax.sim.raster_canvas import RasterConfig
 from carljax.sim.route import Route
 from carljax.sim.scenarios import script
 from carljax.sim.types import (

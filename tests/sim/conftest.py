@@ -8,7 +8,7 @@ from carljax.reward.config import RewardConfig
 from carljax.sim import env as env_module
 from carljax.sim import episodes, town, towns
 from carljax.sim.env import EnvConfig
-from carljax.sim.rasterizer import RasterConfig
+from carljax.sim.raster_canvas import RasterConfig
 
 NUM_EPISODES, NUM_AGENTS, ROUTE_LENGTH = 6, 6, 200.0
 

@@ -90,15 +90,16 @@ class Oracle:
                     self.put(row, column, channel, value)
 
     def road_users(self, agents):
-        """Pedestrians hide obstacles, which hide vehicles, of which brake lights show on top."""
+        """Pedestrians hide obstacles, which hide vehicles, of which lights show on top."""
         layers = []
         for kind, channel in ((KIND_VEHICLE, 3), (KIND_STATIC, 8), (KIND_PEDESTRIAN, 4)):
-            drawn, brakes = Oracle._like(self), Oracle._like(self)
+            drawn, shine = Oracle._like(self), Oracle._like(self)
             for n in range(len(agents.kind)):
                 near = abs(float(agents.z[n]) - self.z) < 8.0
                 if int(agents.kind[n]) == kind != KIND_NONE and near:
-                    drawn.road_user(agents, n, kind, channel, brakes)
-            drawn.image[brakes.image > 0] = 111
+                    drawn.road_user(agents, n, kind, channel, shine)
+            for rank, value in enumerate((111, 22, 44, 77), start=1):
+                drawn.image[shine.image == rank] = value
             layers.append((channel, drawn.image[..., channel]))
         for row, column in self.pixels():
             for channel, image in layers:
@@ -111,8 +112,8 @@ class Oracle:
         other.__dict__ |= self.__dict__ | {"image": np.zeros_like(self.image)}
         return other
 
-    def road_user(self, agents, n, kind, channel, brakes):
-        """One box with its line and its brake light."""
+    def road_user(self, agents, n, kind, channel, shine):
+        """One box with its line, its doors and its lights."""
         (x, y), yaw, speed = map(float, agents.xy[n]), float(agents.yaw[n]), float(agents.speed[n])
         length, width = float(agents.length[n]), float(agents.width[n])
         if kind == KIND_STATIC:
@@ -125,9 +126,18 @@ class Oracle:
             out = length / 2 + k * step
             place = self.pixel(x + out * math.cos(yaw), y + out * math.sin(yaw))
             self.put(*place, channel, code(speed))
-        if kind == KIND_VEHICLE and float(agents.accel[n]) < -1.0:
-            rear = x - 1.5 * math.cos(yaw), y - 1.5 * math.sin(yaw)
-            brakes.box(*rear, yaw, 1.0, 1.0, channel, 111)
+        if kind != KIND_VEHICLE:
+            return
+        signals, cos, sin = int(agents.signals[n]), math.cos(yaw), math.sin(yaw)
+        for bit, ahead, left in ((4, 0.7, 1.8), (5, 0.7, -1.8), (6, -0.7, 1.8), (7, -0.7, -1.8)):
+            if signals >> bit & 1:
+                door = x + ahead * cos - left * sin, y + ahead * sin + left * cos
+                self.box(*door, yaw, 0.4, 2.0, channel, code(speed))
+        lights = ((2, -1.5, 0.0), (3, 0.0, 0.0), (0, 0.5, 0.5), (1, 0.5, -0.5))
+        for rank, (bit, ahead, left) in enumerate(lights, start=1):
+            if signals >> bit & 1:
+                light = x + ahead * cos - left * sin, y + ahead * sin + left * cos
+                shine.box(*light, yaw, 1.0, 1.0, channel, rank)
 
     def route(self, route, idx):
         """Discs around the route points ahead."""

@@ -16,7 +16,8 @@ from carljax.reward.config import RewardConfig
 from carljax.sim import episodes, observation, rasterizer, situation, town
 from carljax.sim.env import EnvConfig, make_env
 from carljax.sim.population import Population
-from carljax.sim.rasterizer import CHANNELS, RasterConfig
+from carljax.sim.raster_canvas import CHANNELS, RasterConfig
+from carljax.sim.types import SIGNAL_BRAKE
 
 
 @pytest.mark.parametrize("wrap", [lambda f: f, jax.jit], ids=["eager", "jit"])
@@ -78,7 +79,7 @@ def test_the_picture_gives_each_thing_its_colour():
     for value, colour in (
         (127, image.VEHICLE[0]),
         (255, image.VEHICLE[1]),
-        (111, image.BRAKE_LIGHT),
+        (111, image.VEHICLE_LIGHT[SIGNAL_BRAKE]),
     ):
         np.testing.assert_array_equal(painted(config, vehicles=value)[0], colour)
 

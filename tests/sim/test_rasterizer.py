@@ -14,15 +14,21 @@ import pytest
 import raster_oracle
 from crossing_world import agents_of, ego_at, road_map, route_east
 
-from carljax.sim import rasterizer
-from carljax.sim.rasterizer import RasterConfig
+from carljax.sim import raster_canvas, raster_users, rasterizer
+from carljax.sim.raster_canvas import RasterConfig
 from carljax.sim.types import (
+    DOOR_FRONT_LEFT,
+    DOOR_REAR_RIGHT,
     KIND_PEDESTRIAN,
     KIND_STATIC,
     KIND_VEHICLE,
     LIGHT_GREEN,
     LIGHT_RED,
     LIGHT_YELLOW,
+    SIGNAL_BRAKE,
+    SIGNAL_EMERGENCY,
+    SIGNAL_LEFT,
+    SIGNAL_RIGHT,
     STOP_LIGHT,
     STOP_SIGN,
     STOP_YIELD,
@@ -111,15 +117,65 @@ def test_a_parked_car_on_the_left_facing_left_has_a_short_line(world):
     assert cells(image[..., CARS]) == expected
 
 
-def test_the_brake_light_of_a_slowing_car(world):
+def test_the_brake_light(world):
     # The light is 1 m square, 1.5 m behind the centre: rows 156 - 2 (18.6 +- 0.5) = 117.8 ...
     # 119.8, columns 126.8 ... 128.8.
-    car = CAR | {"x": -40.15, "y": -1.65, "accel": -1.1}
+    car = CAR | {"x": -40.15, "y": -1.65, "signals": SIGNAL_BRAKE}
     image = draw(world, ego_at(-60.25, -1.75), agents_of(car))[..., CARS]
     assert cells(np.where(image == 111, image, 0)) == block([118, 119], [127, 128], 111)
     assert image[118, 126] == image[117, 127] == 136
-    image = draw(world, ego_at(-60.25, -1.75), agents_of(car | {"accel": -0.9}))[..., CARS]
+    image = draw(world, ego_at(-60.25, -1.75), agents_of(car | {"signals": 0}))[..., CARS]
     assert 111 not in image
+
+
+@pytest.mark.parametrize(
+    ("signal", "value", "rows", "columns"),
+    [
+        # 1 m square at (0.5, 0.5) ahead and left of the centre, which is at row 115.8, column
+        # 127.8: rows 113.8 ... 115.8, columns 125.8 ... 127.8; to the right 127.8 ... 129.8; on the
+        # centre rows 114.8 ... 116.8, columns 126.8 ... 128.8.
+        (SIGNAL_LEFT, 44, [114, 115], [126, 127]),
+        (SIGNAL_RIGHT, 77, [114, 115], [128, 129]),
+        (SIGNAL_EMERGENCY, 22, [115, 116], [127, 128]),
+    ],
+)
+def test_indicators_and_emergency_lights(world, signal, value, rows, columns):
+    car = CAR | {"x": -40.15, "y": -1.65, "signals": signal}
+    image = draw(world, ego_at(-60.25, -1.75), agents_of(car))[..., CARS]
+    assert cells(np.where((image > 0) & (image < 127), image, 0)) == block(rows, columns, value)
+
+
+@pytest.mark.parametrize(
+    ("door", "rows", "columns"),
+    [
+        # 0.4 m by 2 m across at (0.7, 1.8): rows 114 ... 114.8 hold the centre of row 114,
+        # columns 127.8 - 2 (1.8 +- 1) = 122.2 ... 126.2; what the box of the car (126 on) hides
+        # is coded alike. At (-0.7, -1.8): row 116.8 ... 117.6, columns 129.4 ... 133.4.
+        (DOOR_FRONT_LEFT, [114], range(122, 126)),
+        (DOOR_REAR_RIGHT, [117], range(130, 133)),
+    ],
+)
+def test_an_open_door_sticks_out(world, door, rows, columns):
+    car = CAR | {"x": -40.15, "y": -1.65}
+    shut, open_ = (
+        cells(draw(world, ego_at(-60.25, -1.75), agents_of(car | {"signals": s}))[..., CARS])
+        for s in (0, door)
+    )
+    assert {place: v for place, v in open_.items() if place not in shut} == block(
+        rows, columns, 136
+    )
+
+
+def test_a_bus_is_drawn_whole_and_many_lorries_at_least_in_part(world):
+    # 10.3 m: rows 115.8 -+ 10.3 = 105.5 ... 126.1.
+    bus = CAR | {"x": -40.15, "y": -1.65, "length": 10.3, "width": 2.6}
+    image = draw(world, ego_at(-60.25, -1.75), agents_of(bus))[..., CARS]
+    assert (image[106:126, 126:130] == 136).all() and not image[127:].any()
+    convoy = [bus | {"y": -60.0 + 10 * k} for k in range(12)]
+    image = draw(world, ego_at(-60.25, -1.75), agents_of(*convoy, slots=12))[..., CARS]
+    columns = (128 + 2 * (58.25 - 10 * np.arange(12))).astype(int)
+    assert (image[110:121, columns] == 136).all()
+    assert (image[106:126, columns] == 136).all(axis=0).sum() == raster_users.NUM_LONG
 
 
 def test_pedestrians_and_obstacles_have_their_own_channels(world):
@@ -284,7 +340,7 @@ def random_scene(seed, slots=24):
             "width": rng.uniform(1.6, 2.4) if kind == KIND_VEHICLE else rng.uniform(0.5, 2.0),
             "kind": kind,
             "speed": rng.uniform(0, 20) if kind != KIND_STATIC else 0.0,
-            "accel": rng.uniform(-3, 3),
+            "signals": int(rng.choice([0, *range(1, 9), 16, 32, 64, 128])),
             "z": rng.uniform(-9, 9),
         }
         for kind in rng.choice([1, 1, 1, 2, 3], slots)
@@ -322,7 +378,7 @@ def test_random_scenes_match_the_oracle(world, config, seed):
         both = np.count_nonzero((ours == theirs) & (theirs > 0))
         either = np.count_nonzero(ours | theirs)
         least = 0.999 if channel in (ROAD, ROUTE, LINES, SHOULDER) else 0.9
-        assert both >= least * either - 3, rasterizer.CHANNELS[channel]
+        assert both >= least * either - 3, raster_canvas.CHANNELS[channel]
     assert np.count_nonzero(expected.any(axis=(0, 1))) >= 8
 
 
@@ -411,4 +467,4 @@ def test_one_trace_for_all_scenes(world):
 )
 def test_speed_coding_at_known_speeds(speed, value):
     # 127 + int(128 * clip(v + 2.67, 0, 36) / 36): 2.67 -> 9.49, 16.57 -> 58.9, 36 -> 128.
-    assert int(rasterizer.speed_value(jnp.float32(speed))) == value
+    assert int(raster_users.speed_value(jnp.float32(speed))) == value
