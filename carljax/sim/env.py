@@ -1,8 +1,8 @@
 """The driving environment: the only file that composes the simulator.
 
 One environment, unbatched; `vmap` goes above. Order of a step: the ego moves by the action, traffic
-moves by its own rules, one far-away car may be used again nearby, the clock of the lights goes on;
-then the reward looks at where everything is now.
+moves by its own rules, one far-away car may be used again nearby, the clock of the lights goes on,
+scenarios are played; then the reward looks at where everything is now.
 """
 
 from __future__ import annotations
@@ -22,8 +22,10 @@ from carljax.sim.idm import IDMParams
 from carljax.sim.observation import observe
 from carljax.sim.population import Population
 from carljax.sim.raster_canvas import RasterConfig
+from carljax.sim.right_of_way import EgoPlace
 from carljax.sim.route import Route
-from carljax.sim.scenarios import script
+from carljax.sim.scenarios import engine, script
+from carljax.sim.scenarios.actors import Scene
 from carljax.sim.types import (
     EgoState,
     LightClock,
@@ -110,17 +112,26 @@ class DrivingEnv(struct.PyTreeNode):
           episode_idx: () int32, row of the bank.
           key: PRNG key, of all that the bank leaves open.
         """
-        key_light, key = jax.random.split(key)
+        key_light, key_scenarios, key = jax.random.split(key, 3)
         routes, zero_idx = self.bank.routes, jnp.zeros((), jnp.int32)
         ego = _ego_at(routes.xy[episode_idx, 0], routes.z[episode_idx], routes.yaw[episode_idx, 0])
+        place = EgoPlace(routes.lane[episode_idx, 0], zero_idx - 1, routes.lane_s[episode_idx, 0])
+        slots, agents = engine.start(
+            script.empty_slots(self.config.num_scenario_slots),
+            jax.tree.map(lambda x: x[episode_idx], self.bank.agents),
+            self.bank.scenarios,
+            episode_idx,
+            self._scene(ego, place, jnp.zeros((), jnp.float32), is_start=True),
+            key_scenarios,
+        )
         sim = SimState(
             ego=ego,
-            agents=jax.tree.map(lambda x: x[episode_idx], self.bank.agents),
+            agents=agents,
             reward_state=reward.init(ego, routes.stop_kind.shape[1]),
             episode_idx=episode_idx.astype(jnp.int32),
             route_idx=zero_idx,
             walkers=jax.tree.map(lambda x: x[episode_idx], self.bank.walkers),
-            scenarios=script.empty_slots(self.config.num_scenario_slots),
+            scenarios=slots,
             lights=lights.clock(
                 jax.random.uniform(key_light, (), maxval=LIGHT_CLOCK),
                 self.config.num_scenario_slots,
@@ -141,10 +152,13 @@ class DrivingEnv(struct.PyTreeNode):
     def advance(self, state: State, action: jax.Array) -> State:
         """Returns what `step` does, without the observation."""
         before = state.pipeline_state
-        key, key_traffic, key_respawn = jax.random.split(before.key, 3)
+        key, key_traffic, key_respawn, key_scenarios = jax.random.split(before.key, 4)
         dt, road_map = self.config.dt, self.bank.road_map
         stretch, first = route.window(self.bank.routes, before.episode_idx, before.route_idx)
         idx = before.route_idx - first
+        played = engine.scripts(self.bank.scenarios, before.episode_idx, before.scenarios)
+        route_s = engine.progress(stretch, idx, before.ego)
+        action = engine.disturb(action, before.scenarios, played, route_s)
         ego = bicycle.step(before.ego, *bicycle.from_action(action), self.vehicle, dt)
         place = situation.ego_place(before.ego, road_map, stretch, idx)
         rows = self.config.population
@@ -172,8 +186,16 @@ class DrivingEnv(struct.PyTreeNode):
         )
         cars = population.rows(vehicles, rows.cars)
         agents = population.join(traffic_rows, cars, others)
-        clock = before.lights.replace(time=before.lights.time + dt)
         idx = route.advance(stretch, idx, ego.xy)
+        slots, agents, clock = engine.step(
+            before.scenarios,
+            played,
+            agents,
+            before.lights.replace(time=before.lights.time + dt),
+            self._scene(ego, place, engine.progress(stretch, idx, ego), is_start=False),
+            key_scenarios,
+            dt,
+        )
         seen = self._situation(ego, stretch, first, idx, clock)
         paid, terminated, memory, terms = reward.compute(
             before, ego, agents, seen, self.vehicle, self.reward_config, dt
@@ -183,6 +205,7 @@ class DrivingEnv(struct.PyTreeNode):
             agents=agents,
             reward_state=memory,
             route_idx=seen.route_idx,
+            scenarios=slots,
             lights=clock,
             step_count=before.step_count + 1,
             key=key,
@@ -203,6 +226,17 @@ class DrivingEnv(struct.PyTreeNode):
     def observe(self, state: State) -> State:
         """Returns the state with what the policy and the critic see of it."""
         return state.replace(obs=observe(self, state.pipeline_state))
+
+    def _scene(self, ego: EgoState, place: EgoPlace, route_s: jax.Array, is_start: bool) -> Scene:
+        return Scene(
+            ego=ego,
+            ego_length=jnp.float32(self.vehicle.length),
+            ego_place=place,
+            route_s=route_s,
+            road_map=self.bank.road_map,
+            is_start=is_start,
+            rows=self.config.population,
+        )
 
     def _situation(
         self,
@@ -261,6 +295,7 @@ EPISODE_METRICS = (
     "episode/route_completion",
     "episode/km",
     "episode/outside_lanes_km",
+    "episode/scenarios",
     *(f"episode/{name}_frac" for name in ENDS),
 )
 METRICS = (*REWARD_METRICS, *EPISODE_METRICS, "ego/speed")
@@ -287,5 +322,6 @@ def _metrics(
         "episode/route_completion": jnp.where(terms.finished, 100.0, completion),
         "episode/km": old["episode/km"] + driven,
         "episode/outside_lanes_km": old["episode/outside_lanes_km"] + outside,
+        "episode/scenarios": after.scenarios.num_triggered.astype(jnp.float32),
         "ego/speed": after.ego.speed,
     }

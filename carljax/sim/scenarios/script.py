@@ -63,6 +63,7 @@ class ScriptedOthers(struct.PyTreeNode):
     Attributes:
       kind: (F,) int32, KIND_*; KIND_NONE for nobody.
       xy: (F, 2) m, where it stands at first.
+      z: (F,) m.
       yaw: (F,) rad.
       length, width: (F,) m.
       speed: (F,) m/s, once it moves; 0 stands for good.
@@ -75,6 +76,7 @@ class ScriptedOthers(struct.PyTreeNode):
 
     kind: jax.Array
     xy: jax.Array
+    z: jax.Array
     yaw: jax.Array
     length: jax.Array
     width: jax.Array
@@ -126,23 +128,45 @@ class ScenarioSlots(struct.PyTreeNode):
 
     Attributes:
       index: (H,) int32, row of the episode's scenarios; -1 for a free slot.
+      is_leaving: (H,) bool, it is over, but some of its actors are still in sight.
       triggered_s: (H,) s since the trigger; negative while armed only.
+      has_appeared: (H, NUM_CARS) bool, this car has taken its place.
       has_started: (H, NUM_OTHERS) bool, this actor moves or has moved.
       moved: (H, NUM_OTHERS) m it has moved.
+      noise: (H, NUM_PATCHES, 2) in [-1, 1], disturbance of steering and throttle on each patch.
+      braker: (H,) int32, row of the vehicle that brakes ahead of the ego; -1 before there is one.
+      braked_s: (H,) s for which it has.
       next_index: () int32, the next scenario of the route to be armed.
+      num_triggered: () int32, scenarios that have begun in this episode.
       ended_kind: () int32, kind of the scenario that was over in this step, -1 for none.
       has_timed_out: () bool, that scenario ended by its timeout.
       has_failed_to_yield: () bool, an emergency vehicle of that scenario was still behind the ego.
     """
 
     index: jax.Array
+    is_leaving: jax.Array
     triggered_s: jax.Array
+    has_appeared: jax.Array
     has_started: jax.Array
     moved: jax.Array
+    noise: jax.Array
+    braker: jax.Array
+    braked_s: jax.Array
     next_index: jax.Array
+    num_triggered: jax.Array
     ended_kind: jax.Array
     has_timed_out: jax.Array
     has_failed_to_yield: jax.Array
+
+    @property
+    def is_armed(self) -> jax.Array:
+        """(H,) bool: there, not yet triggered."""
+        return (self.index >= 0) & ~self.is_leaving & (self.triggered_s < 0.0)
+
+    @property
+    def is_playing(self) -> jax.Array:
+        """(H,) bool: from the trigger to the end."""
+        return (self.index >= 0) & ~self.is_leaving & (self.triggered_s >= 0.0)
 
 
 def empty_slots(num_slots: int) -> ScenarioSlots:
@@ -151,10 +175,16 @@ def empty_slots(num_slots: int) -> ScenarioSlots:
     false = jnp.zeros((), bool)
     return ScenarioSlots(
         index=jnp.full(num_slots, -1, jnp.int32),
+        is_leaving=jnp.zeros(num_slots, bool),
         triggered_s=jnp.full(num_slots, -1.0, jnp.float32),
+        has_appeared=jnp.zeros((num_slots, NUM_CARS), bool),
         has_started=jnp.zeros((num_slots, NUM_OTHERS), bool),
         moved=jnp.zeros((num_slots, NUM_OTHERS), jnp.float32),
+        noise=jnp.zeros((num_slots, NUM_PATCHES, 2), jnp.float32),
+        braker=jnp.full(num_slots, -1, jnp.int32),
+        braked_s=jnp.zeros(num_slots, jnp.float32),
         next_index=jnp.zeros((), jnp.int32),
+        num_triggered=jnp.zeros((), jnp.int32),
         ended_kind=none,
         has_timed_out=false,
         has_failed_to_yield=false,
@@ -190,6 +220,7 @@ def nothing(num: int) -> Scenario:
         others=ScriptedOthers(
             kind=full(0, others, dtype=np.int32),
             xy=full(0, others, 2),
+            z=full(0, others),
             yaw=full(0, others),
             length=full(0, others),
             width=full(0, others),

@@ -1,0 +1,326 @@
+"""Plays the scenarios of a route: one engine for all kinds, everything in fixed slots.
+
+When the ego comes to a scenario's `arm_s` its actors take their places, if nobody sees them appear
+and nobody is in their place; else the scenario waits, and is left out once its trigger is passed.
+From the trigger on it plays, until the ego is past its end or its time is up. Then its actors leave
+as soon as nobody sees them, and the slot is free.
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+
+from carljax.sim import geometry, population
+from carljax.sim.route import Route
+from carljax.sim.scenarios import actors
+from carljax.sim.scenarios.actors import Cues, Scene
+from carljax.sim.scenarios.script import (
+    DRIVE_FLOW,
+    NUM_CARS,
+    NUM_OTHERS,
+    Scenario,
+    ScenarioSlots,
+)
+from carljax.sim.types import KIND_NONE, SIGNAL_EMERGENCY, Agents, EgoState, LightClock
+
+# m within which a car ahead is the one that brakes. source: ours, a headway of 3 s at 50 km/h
+LEADER_RANGE = 40.0
+FAR = 1e3  # m
+# m beyond its trigger within which a scenario may still be armed. source: ours, a step at 30 m/s
+LATE = 3.0
+
+
+def scripts(scenarios: Scenario, episode_idx: jax.Array, slots: ScenarioSlots) -> Scenario:
+    """The rows that a step needs, (H + 1): of the scenarios in the slots and, last, the next one.
+
+    Args:
+      scenarios: the bank's, leading axes S, E.
+      episode_idx: () int32.
+      slots: see `ScenarioSlots`.
+    """
+    num = scenarios.kind.shape[1]
+    index = jnp.append(slots.index, slots.next_index)
+    found = jax.tree.map(lambda x: x[episode_idx, jnp.clip(index, 0, num - 1)], scenarios)
+    return found.replace(kind=jnp.where((index >= 0) & (index < num), found.kind, -1))
+
+
+def progress(stretch: Route, idx: jax.Array, ego: EgoState) -> jax.Array:
+    """() m, where on its route the ego is, between the points too."""
+    along = geometry.to_frame(ego.xy, stretch.xy[idx], stretch.yaw[idx])[0]
+    return stretch.s[idx] + jnp.clip(along, 0.0, 1.0)
+
+
+def disturb(
+    action: jax.Array, slots: ScenarioSlots, played: Scenario, route_s: jax.Array
+) -> jax.Array:
+    """(2,) the action as the car takes it: on the patches of a scenario it is not what was meant.
+
+    Args:
+      action: (2,) steering and longitudinal.
+      slots: see `ScenarioSlots`.
+      played: (H + 1,) see `scripts`.
+      route_s: () m, see `progress`.
+    """
+    script = _in_slots(played)
+    on = (script.patches[..., 0] <= route_s) & (route_s < script.patches[..., 1])
+    on &= slots.is_playing[:, None]
+    half_width = jnp.stack([script.steer_noise, script.throttle_noise], axis=-1)[:, None]
+    return action + jnp.where(on[..., None], slots.noise * half_width, 0.0).sum(axis=(0, 1))
+
+
+def start(
+    slots: ScenarioSlots,
+    agents: Agents,
+    scenarios: Scenario,
+    episode_idx: jax.Array,
+    scene: Scene,
+    key: jax.Array,
+) -> tuple[ScenarioSlots, Agents]:
+    """Sets up the scenarios around the start of a route; there, actors may appear in sight.
+
+    Args:
+      slots: empty.
+      agents: (N,) at the start.
+      scenarios: the bank's.
+      episode_idx: () int32.
+      scene: at the start.
+      key: PRNG key.
+
+    Returns:
+      Slots and agents.
+    """
+
+    def one(
+        carry: tuple[ScenarioSlots, Agents], key: jax.Array
+    ) -> tuple[tuple[ScenarioSlots, Agents], None]:
+        slots, agents = carry
+        played = scripts(scenarios, episode_idx, slots)
+        slots, played, agents = _arm(slots, played, agents, scene, key)
+        return _cars(slots, _in_slots(played), agents, scene), None
+
+    if scene.rows.num_slots == 0:
+        return slots, agents
+    carry, _ = jax.lax.scan(one, (slots, agents), jax.random.split(key, scene.rows.num_slots))
+    return carry
+
+
+def step(
+    slots: ScenarioSlots,
+    played: Scenario,
+    agents: Agents,
+    clock: LightClock,
+    scene: Scene,
+    key: jax.Array,
+    dt: float,
+) -> tuple[ScenarioSlots, Agents, LightClock]:
+    """Plays all scenarios for one step.
+
+    Args:
+      slots: before.
+      played: (H + 1,) see `scripts`.
+      agents: (N,) after traffic has moved.
+      clock: of the lights, after the step.
+      scene: after the ego's step.
+      key: PRNG key.
+      dt: s.
+
+    Returns:
+      Slots, agents and clock dt later.
+    """
+    if scene.rows.num_slots == 0:
+        return slots, agents, clock
+    slots, played, agents = _arm(slots, played, agents, scene, key)
+    script = _in_slots(played)
+    slots, clock = _trigger(slots, script, clock, scene, dt)
+    slots, clock = _end(slots, script, clock, agents, scene)
+    slots, agents = _others(slots, script, agents, scene, dt)
+    slots, agents = _cars(slots, script, agents, scene)
+    slots, agents = _brake(slots, script, agents, scene, dt)
+    return *_leave(slots, agents, scene), clock
+
+
+def _in_slots(played: Scenario) -> Scenario:
+    """(H,) the scenarios in the slots, without the next one."""
+    return jax.tree.map(lambda x: x[:-1], played)
+
+
+def _arm(
+    slots: ScenarioSlots, played: Scenario, agents: Agents, scene: Scene, key: jax.Array
+) -> tuple[ScenarioSlots, Scenario, Agents]:
+    """Gives the next scenario a slot, if it is time and its actors can take their places."""
+    coming = jax.tree.map(lambda x: x[-1], played)
+    free = slots.index < 0
+    slot = jnp.argmax(2 * free + slots.is_leaving)
+    exists = coming.kind >= 0
+    missed = exists & (scene.route_s > coming.trigger_s + LATE)
+    arms = exists & ~missed & (scene.route_s >= coming.arm_s)
+    arms &= (free | slots.is_leaving)[slot] & _has_room(coming, agents, scene)
+    taken = arms & (jnp.arange(scene.rows.num_slots) == slot)
+
+    def fill(new: jax.Array, old: jax.Array) -> jax.Array:
+        return jnp.where(taken.reshape(-1, *[1] * (old.ndim - 1)), new, old)
+
+    played = jax.tree.map(lambda x: x.at[:-1].set(fill(x[-1], x[:-1])), played)
+    noise = jax.random.uniform(key, slots.noise.shape, minval=-1.0)
+    slots = slots.replace(
+        index=fill(slots.next_index, slots.index),
+        is_leaving=slots.is_leaving & ~taken,
+        triggered_s=fill(jnp.float32(-1.0), slots.triggered_s),
+        has_appeared=slots.has_appeared & ~taken[:, None],
+        has_started=slots.has_started & ~taken[:, None],
+        moved=fill(jnp.float32(0.0), slots.moved),
+        noise=fill(noise, slots.noise),
+        braker=fill(jnp.int32(-1), slots.braker),
+        braked_s=fill(jnp.float32(0.0), slots.braked_s),
+        next_index=slots.next_index + (arms | missed),
+    )
+    rows = scene.rows
+    cars = population.rows(agents, rows.cars)
+    cars = actors.take_away(cars, jnp.repeat(taken, NUM_CARS))
+    others = population.rows(agents, rows.others)
+    appears = jnp.repeat(taken, NUM_OTHERS)
+    others = actors.put_others(others, appears, actors.flat(_in_slots(played).others))
+    return slots, played, population.with_scenarios(agents, cars, others, rows)
+
+
+def _has_room(coming: Scenario, agents: Agents, scene: Scene) -> jax.Array:
+    """() bool: whoever of a scenario has to be there from the beginning can be."""
+    cars, others = coming.cars, coming.others
+    here = (cars.model >= 0) & ~cars.from_trigger & (cars.drive != DRIVE_FLOW)
+    at = actors.car_start(cars, scene.road_map).xy
+    room = ~here | actors.may_appear(at, actors.car_length(cars), actors.CAR_GAP, agents, scene)
+    stands = others.kind != KIND_NONE
+    free = actors.may_appear(others.xy, others.length, actors.OTHER_GAP, agents, scene)
+    return room.all() & (~stands | free).all()
+
+
+def _trigger(
+    slots: ScenarioSlots, script: Scenario, clock: LightClock, scene: Scene, dt: float
+) -> tuple[ScenarioSlots, LightClock]:
+    """Begins what the ego has come to, and counts the time since."""
+    plays = slots.is_playing
+    begins = slots.is_armed & (scene.route_s >= script.trigger_s)
+    since = jnp.where(plays, slots.triggered_s + dt, slots.triggered_s)
+    slots = slots.replace(
+        triggered_s=jnp.where(begins, 0.0, since),
+        num_triggered=slots.num_triggered + begins.sum(),
+    )
+    holds = begins & (script.held_junction >= 0)
+    clock = clock.replace(
+        held_junction=jnp.where(holds, script.held_junction, clock.held_junction),
+        held_green=jnp.where(holds[:, None], script.held_green, clock.held_green),
+        held_from=jnp.where(holds, clock.time, clock.held_from),
+        held_until=jnp.where(holds, jnp.inf, clock.held_until),
+    )
+    return slots, clock
+
+
+def _end(
+    slots: ScenarioSlots, script: Scenario, clock: LightClock, agents: Agents, scene: Scene
+) -> tuple[ScenarioSlots, LightClock]:
+    """Ends what the ego has passed or what takes too long: one a step, so that none goes unseen."""
+    passed = scene.route_s >= script.end_s
+    over = slots.is_playing & (passed | (slots.triggered_s > script.timeout_s))
+    ends = over & (jnp.cumsum(over) == 1)
+    cars = population.rows(agents, scene.rows.cars)
+    behind = geometry.to_frame(cars.xy, scene.ego.xy, scene.ego.yaw)[:, 0] < 0.0
+    flashes = (actors.flat(script.cars).signals & SIGNAL_EMERGENCY) > 0
+    follows = (cars.valid & behind & flashes).reshape(-1, NUM_CARS).any(axis=1)
+    slots = slots.replace(
+        is_leaving=slots.is_leaving | ends,
+        ended_kind=jnp.where(ends, script.kind, -1).max(),
+        has_timed_out=(ends & ~passed).any(),
+        has_failed_to_yield=(ends & follows).any(),
+    )
+    until = jnp.where(ends, jnp.minimum(clock.held_until, clock.time), clock.held_until)
+    return slots, clock.replace(held_until=until)
+
+
+def _others(
+    slots: ScenarioSlots, script: Scenario, agents: Agents, scene: Scene, dt: float
+) -> tuple[ScenarioSlots, Agents]:
+    """Lets those off the lanes start, and moves them."""
+    others = population.rows(agents, scene.rows.others)
+    flat = actors.flat(script.others)
+    starts = actors.starts_moving(flat, _cues(slots, NUM_OTHERS), scene)
+    started = slots.has_started | starts.reshape(slots.has_started.shape)
+    others, moved = actors.move_others(
+        others, flat, started.reshape(-1), slots.moved.reshape(-1), dt
+    )
+    slots = slots.replace(has_started=started, moved=moved.reshape(slots.moved.shape))
+    cars = population.rows(agents, scene.rows.cars)
+    return slots, population.with_scenarios(agents, cars, others, scene.rows)
+
+
+def _cars(
+    slots: ScenarioSlots, script: Scenario, agents: Agents, scene: Scene
+) -> tuple[ScenarioSlots, Agents]:
+    """Lets cars on lanes take their places when it is their turn, and tells them how to drive."""
+    cars = population.rows(agents, scene.rows.cars)
+    flat, cues = actors.flat(script.cars), _cues(slots, NUM_CARS)
+    came = actors.way(cars, flat, scene.road_map)
+    waits = actors.waiting(cars, slots.has_appeared.reshape(-1), flat, cues, came)
+    at = actors.car_start(flat, scene.road_map)
+    able = actors.may_appear(at.xy, actors.car_length(flat), actors.CAR_GAP, agents, scene)
+    able &= ~cars.valid | actors.is_hidden(cars.xy, scene)
+    starts = actors.one_at_a_time(at.xy, waits & able)
+    cars = actors.put_cars(cars, starts, flat, at, scene.road_map)
+    cars = actors.command_cars(cars, flat, cues, jnp.where(starts, flat.s, came), scene)
+    appeared = slots.has_appeared | starts.reshape(slots.has_appeared.shape)
+    others = population.rows(agents, scene.rows.others)
+    agents = population.with_scenarios(agents, cars, others, scene.rows)
+    return slots.replace(has_appeared=appeared), agents
+
+
+def _brake(
+    slots: ScenarioSlots, script: Scenario, agents: Agents, scene: Scene, dt: float
+) -> tuple[ScenarioSlots, Agents]:
+    """Makes the car ahead of the ego brake, once there is one."""
+    num = scene.rows.num_vehicles
+    leader, gap = _leader(population.rows(agents, scene.rows.vehicles), scene)
+    plays = slots.is_playing & (script.brake_s > 0.0)
+    finds = plays & (slots.braker < 0) & (gap < LEADER_RANGE)
+    braker = jnp.where(finds, leader, slots.braker)
+    brakes = plays & (braker >= 0) & (slots.braked_s < script.brake_s)
+    hard = (braker[:, None] == jnp.arange(num)) & brakes[:, None]
+    hard = jnp.append(hard.any(axis=0), jnp.zeros(scene.rows.num_agents - num, bool))
+    braked = slots.braked_s + jnp.where(brakes, dt, 0.0)
+    return slots.replace(braker=braker, braked_s=braked), agents.replace(is_braking_hard=hard)
+
+
+def _leader(vehicles: Agents, scene: Scene) -> tuple[jax.Array, jax.Array]:
+    """The nearest vehicle ahead on the ego's lane or the next one: its row, and m to it."""
+    place = scene.ego_place
+    left = scene.road_map.lane_length[jnp.maximum(place.lane, 0)] - place.s
+    lane = vehicles.lanes[:, 0]
+    here = (lane == place.lane) & (vehicles.lane_s > place.s)
+    there = (lane == place.next_lane) & (lane != place.lane)
+    gap = jnp.where(here, vehicles.lane_s - place.s, jnp.where(there, left + vehicles.lane_s, FAR))
+    gap = jnp.where(vehicles.valid & (lane >= 0), gap, FAR)
+    leader = jnp.argmin(gap)
+    return leader.astype(jnp.int32), gap[leader]
+
+
+def _leave(slots: ScenarioSlots, agents: Agents, scene: Scene) -> tuple[ScenarioSlots, Agents]:
+    """Takes away whom nobody sees once a scenario is over; without any, its slot is free."""
+    cars = population.rows(agents, scene.rows.cars)
+    others = population.rows(agents, scene.rows.others)
+    cars, others = (
+        actors.take_away(part, jnp.repeat(slots.is_leaving, num) & actors.is_hidden(part.xy, scene))
+        for part, num in ((cars, NUM_CARS), (others, NUM_OTHERS))
+    )
+    here = [part.valid.reshape(len(slots.index), -1).any(axis=1) for part in (cars, others)]
+    empty = slots.is_leaving & ~here[0] & ~here[1]
+    slots = slots.replace(
+        index=jnp.where(empty, -1, slots.index), is_leaving=slots.is_leaving & ~empty
+    )
+    return slots, population.with_scenarios(agents, cars, others, scene.rows)
+
+
+def _cues(slots: ScenarioSlots, num: int) -> Cues:
+    """What `num` actors of each slot go by."""
+    return Cues(
+        is_active=jnp.repeat(slots.is_armed | slots.is_playing, num),
+        triggered_s=jnp.repeat(slots.triggered_s, num),
+    )
