@@ -1,0 +1,14 @@
+"""NonSignalizedJunctionLeftTurn: the ego turns left, without lights, across oncoming cars."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from carljax.sim.scenarios import junction_flow
+from carljax.sim.scenarios.script import Scenario
+from carljax.sim.scenarios.site import Site
+
+
+def place(site: Site, rng: np.random.Generator) -> Scenario | None:
+    """See `junction_flow.place`."""
+    return junction_flow.place(site, rng, junction_flow.ONCOMING, is_signalized=False)
