@@ -50,9 +50,10 @@ DOORS = {
     DOOR_REAR_RIGHT: (-0.7, -1.8),
 }
 
-# Samples of a box are as many as the longest box needs, so few rows get enough for a bus. Ours.
-SHORT_LENGTH, LONG_LENGTH, WIDTH = 6.0, 10.4, 2.6  # m; larger boxes show gaps
-NUM_LONG = 8  # so many of the longest boxes may be longer than SHORT_LENGTH
+# Samples of a box are as many as the largest box needs, so only a few rows get enough for a bus,
+# and only a few may have doors open. Ours.
+CAR_SIZE, BUS_SIZE = (6.0, 2.4), (10.4, 2.6)  # m; larger boxes show gaps
+NUM_LARGE, NUM_OPEN = 8, 4
 
 # Codes of the canvas.
 _VEHICLE, _LIGHT, _STATIC, _PEDESTRIAN = 1, 130, 134, 135
@@ -130,20 +131,18 @@ def _boxes(
     code: jax.Array,
     config: RasterConfig,
 ) -> jax.Array:
-    """Bodies: all as if they were short, then the few long ones again."""
+    """Bodies: all as if they were no larger than cars, then the few large ones again."""
     least = jnp.where(agents.kind == KIND_STATIC, 0.0, 2 * HALF_EXTENT_MIN)
     length, width = jnp.maximum(agents.length, least), jnp.maximum(agents.width, least)
     turn = agents.yaw - ego.yaw
-    short, limits = jnp.minimum(length, SHORT_LENGTH), (SHORT_LENGTH, WIDTH)
-    at = box_pixels(agents.xy, turn, short, width, shown, limits, ego, config)
+    car_length, car_width = jnp.minimum(length, CAR_SIZE[0]), jnp.minimum(width, CAR_SIZE[1])
+    at = box_pixels(agents.xy, turn, car_length, car_width, shown, CAR_SIZE, ego, config)
     canvas = canvas.at[at].max(code[:, None], **SCATTER)
-    long_length, long = jax.lax.top_k(length, min(NUM_LONG, length.shape[0]))
-    is_long = shown[long] & (long_length > SHORT_LENGTH)
-    limits = (LONG_LENGTH, WIDTH)
-    at = box_pixels(
-        agents.xy[long], turn[long], long_length, width[long], is_long, limits, ego, config
-    )
-    return canvas.at[at].max(code[long, None], **SCATTER)
+    excess = jnp.maximum(length - CAR_SIZE[0], width - CAR_SIZE[1])
+    excess, large = jax.lax.top_k(jnp.where(shown, excess, -1.0), min(NUM_LARGE, len(shown)))
+    size = (length[large], width[large])
+    at = box_pixels(agents.xy[large], turn[large], *size, excess > 0.0, BUS_SIZE, ego, config)
+    return canvas.at[at].max(code[large, None], **SCATTER)
 
 
 def _forecast_lines(
@@ -182,9 +181,11 @@ def _doors(
     config: RasterConfig,
 ) -> jax.Array:
     """Open doors, coded as the vehicle is."""
-    size = (DOOR_LENGTH, DOOR_WIDTH)
-    at = _parts(ego, agents, shown, DOORS, size, config)
-    return canvas.at[at].max(jnp.tile(code, len(DOORS))[:, None], **SCATTER)
+    is_open = shown & (agents.signals >= min(DOORS))
+    is_open, row = jax.lax.top_k(is_open.astype(jnp.int32), min(NUM_OPEN, len(shown)))
+    some = jax.tree.map(lambda x: x[row], agents)
+    at = _parts(ego, some, is_open > 0, DOORS, (DOOR_LENGTH, DOOR_WIDTH), config)
+    return canvas.at[at].max(jnp.tile(code[row], len(DOORS))[:, None], **SCATTER)
 
 
 def _lights(

@@ -175,7 +175,7 @@ def test_a_bus_is_drawn_whole_and_many_lorries_at_least_in_part(world):
     image = draw(world, ego_at(-60.25, -1.75), agents_of(*convoy, slots=12))[..., CARS]
     columns = (128 + 2 * (58.25 - 10 * np.arange(12))).astype(int)
     assert (image[110:121, columns] == 136).all()
-    assert (image[106:126, columns] == 136).all(axis=0).sum() == raster_users.NUM_LONG
+    assert (image[106:126, columns] == 136).all(axis=0).sum() == raster_users.NUM_LARGE
 
 
 def test_pedestrians_and_obstacles_have_their_own_channels(world):
