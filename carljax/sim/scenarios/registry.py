@@ -12,11 +12,15 @@ from collections.abc import Callable
 import numpy as np
 
 from carljax.sim.scenarios import (
+    control_loss,
+    dynamic_object_crossing,
+    hard_brake,
     non_signalized_left_turn,
     non_signalized_right_turn,
     opposite_vehicle_running_red_light,
     signalized_left_turn,
     signalized_right_turn,
+    vehicle_turning,
 )
 from carljax.sim.scenarios.script import Scenario
 from carljax.sim.scenarios.site import Site
@@ -24,6 +28,10 @@ from carljax.sim.scenarios.site import Site
 Place = Callable[[Site, np.random.Generator], Scenario | None]
 
 PLACE: dict[str, Place] = {
+    "ControlLoss": control_loss.place,
+    "HardBreakRoute": hard_brake.place,
+    "DynamicObjectCrossing": dynamic_object_crossing.place,
+    "VehicleTurningRoute": vehicle_turning.place,
     "SignalizedJunctionLeftTurn": signalized_left_turn.place,
     "SignalizedJunctionRightTurn": signalized_right_turn.place,
     "NonSignalizedJunctionLeftTurn": non_signalized_left_turn.place,

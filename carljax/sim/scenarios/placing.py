@@ -1,0 +1,81 @@
+"""Where actors stand beside a route, and from where nobody sees them appear. Host only."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from carljax.sim.respawn import VIEW_BACK, VIEW_FRONT, VIEW_SIDE
+from carljax.sim.scenarios.site import Place, Site
+
+SIGHT_SLACK = 2.0  # m; the ego is not always on its route's line. source: ours
+ARM_AHEAD = 15.0  # m before the last chance to appear unseen; a place may be taken. source: ours
+FARTHEST_PAVEMENT = 20.0  # m to the side. source: ours, four lanes and a verge
+STRIP = 1.5  # m along the road in which lanes beside a place are looked for. source: ours
+VERGE = 1.5  # m beyond the road's edge, where there is no pavement. source: CARLA's scenario runner
+
+
+def arm_s(site: Site, xy: np.ndarray) -> float:
+    """Where on the route actors should take their places, at the trigger or before it.
+
+    Args:
+      site: of the scenario.
+      xy: (n, 2) m, places of the actors.
+
+    Returns:
+      m on the route, shortly before the last place from where none of them is in sight; 0, the
+      start of the episode, where there is no such place.
+    """
+    num = site.index + 1
+    yaw = np.asarray(site.route.yaw[:num], float)[:, None]
+    offset = np.reshape(xy, (1, -1, 2)) - np.asarray(site.route.xy[:num], float)[:, None]
+    ahead = offset[..., 0] * np.cos(yaw) + offset[..., 1] * np.sin(yaw)
+    left = offset[..., 1] * np.cos(yaw) - offset[..., 0] * np.sin(yaw)
+    hidden = (ahead > VIEW_FRONT + SIGHT_SLACK) | (ahead < -VIEW_BACK - SIGHT_SLACK)
+    hidden |= np.abs(left) > VIEW_SIDE + SIGHT_SLACK
+    unseen = np.flatnonzero(hidden.all(axis=1))
+    if len(unseen) == 0:
+        return 0.0
+    return max(0.0, float(site.route.s[unseen[-1]]) - ARM_AHEAD)
+
+
+def beside(place: Place, ahead: float, left: float) -> np.ndarray:
+    """(2,) m, the point that far ahead and to the left of a place on the route."""
+    cos, sin = np.cos(place.yaw), np.sin(place.yaw)
+    return place.xy + np.array([ahead * cos - left * sin, ahead * sin + left * cos])
+
+
+def height(site: Site, place: Place) -> float:
+    """Height of the road at a place, m."""
+    table = site.town.lanes
+    spacing = table.length[place.lane] / (table.num_points[place.lane] - 1)
+    row = min(round(place.lane_s / spacing), int(table.num_points[place.lane]) - 1)
+    return float(table.point_xyz[table.start[place.lane] + row, 2])
+
+
+def pavement(site: Site, place: Place, side: float) -> float:
+    """How far to the side of a place one stands beside the road, m.
+
+    Args:
+      site: of the scenario.
+      place: on the route.
+      side: 1 for the left, -1 for the right.
+
+    Returns:
+      m to the middle of the pavement, where there is one; else to the verge beyond the road's edge.
+    """
+    network = site.town.network
+    raw = site.town.lanes.members[place.lane]
+    roads = {network.lanes[row].road_id for row in raw}
+    walks, edges = [], [0.0]
+    for lane in network.lanes:
+        offset = lane.xyz[:, :2] - place.xy
+        if np.abs(offset).max(axis=1).min() > FARTHEST_PAVEMENT:
+            continue
+        ahead = offset @ [np.cos(place.yaw), np.sin(place.yaw)]
+        across = side * (offset @ [-np.sin(place.yaw), np.cos(place.yaw)])
+        near = (np.abs(ahead) < STRIP) & (across > -0.5) & (across < FARTHEST_PAVEMENT)
+        if lane.kind == "sidewalk":
+            walks.extend(across[near & (across > 1.0)])
+        elif lane.road_id in roads:
+            edges.extend((across + 0.5 * lane.width)[near])
+    return float(min(walks)) if walks else float(max(edges)) + VERGE
