@@ -44,6 +44,7 @@ class RoadMap(struct.PyTreeNode):
       lane_fork: (K,) int32, equal for lanes that leave the same lane.
       lane_yield_s: (K,) m along it where it comes near the first lane that it has to mind at its
         junction: one it owes, or an equal one without lights; infinity where there is none.
+      lane_signal: (K,) int32, SIGNAL_* bit shown by those who turn on it, 0 where it does not turn.
       lane_stop_s: (K,) m, where its stop line lies.
       lane_stop_kind: (K,) int32, STOP_*.
       lane_light: (K,) int32, row in the light table or -1.
@@ -62,8 +63,7 @@ class RoadMap(struct.PyTreeNode):
       spawn_lane: (M, Gy, Gx, C) int32, places for traffic to appear when the ego is in that grid
         cell; -1 pads.
       spawn_s: (M, Gy, Gx, C) m.
-      walk_xy: (Wn, 2) m, nodes of the towns' walk graphs; the last row belongs to none.
-      walk_z: (Wn,) m.
+      walk_xyz: (Wn, 3) m, nodes of the towns' walk graphs; the last row belongs to none.
       walk_neighbours: (Wn, D) int32, D the most edges from any node; -1 pads.
       walk_yaw: (Wn, D) rad, direction of each edge.
       walk_kind: (Wn, D) int32, WALK_* of each edge.
@@ -82,6 +82,7 @@ class RoadMap(struct.PyTreeNode):
     lane_conflict: jax.Array
     lane_fork: jax.Array
     lane_yield_s: jax.Array
+    lane_signal: jax.Array
     lane_stop_s: jax.Array
     lane_stop_kind: jax.Array
     lane_light: jax.Array
@@ -101,8 +102,7 @@ class RoadMap(struct.PyTreeNode):
     origin: jax.Array
     spawn_lane: jax.Array
     spawn_s: jax.Array
-    walk_xy: jax.Array
-    walk_z: jax.Array
+    walk_xyz: jax.Array
     walk_neighbours: jax.Array
     walk_yaw: jax.Array
     walk_kind: jax.Array

@@ -9,9 +9,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from carljax.sim import atlas, spawn, walk_graph
+from carljax.sim import atlas, junctions, spawn, walk_graph
 from carljax.sim.road_map import PIXELS_PER_METRE, WALK_PAVEMENT, RoadMap
 from carljax.sim.town import Town, offsets
+from carljax.sim.types import SIGNAL_LEFT, SIGNAL_RIGHT
 
 
 def build(towns: Sequence[Town], seed: int = 0) -> RoadMap:
@@ -64,6 +65,7 @@ def _lane_arrays(towns: Sequence[Town]) -> dict[str, np.ndarray]:
             "lane_conflict": _widen(cross.conflict, slots, 0),
             "lane_fork": fork,
             "lane_yield_s": cross.yield_s,
+            "lane_signal": _turn_signals(town),
             "lane_stop_s": table.stop_s,
             "lane_stop_kind": table.stop_kind,
             "lane_light": _shift(light.lane_light, first.light),
@@ -91,8 +93,7 @@ def _walk_arrays(towns: Sequence[Town]) -> dict[str, np.ndarray]:
     for town, first in zip(towns, offsets(towns), strict=True):
         graph = town.walks
         arrays = {
-            "walk_xy": graph.xy,
-            "walk_z": graph.z,
+            "walk_xyz": graph.xyz,
             "walk_neighbours": _widen(_shift(graph.neighbours, first.walk), most, -1),
             "walk_yaw": _widen(graph.yaw, most, 0),
             "walk_kind": _widen(graph.kind, most, WALK_PAVEMENT),
@@ -105,6 +106,14 @@ def _walk_arrays(towns: Sequence[Town]) -> dict[str, np.ndarray]:
         name: np.concatenate([*values, nobody[name].astype(values[0].dtype)])
         for name, values in rows.items()
     }
+
+
+def _turn_signals(town: Town) -> np.ndarray:
+    """(K,) what is shown on lanes of junctions that turn."""
+    turn = np.array([junctions.turn(town.lanes, row) for row in range(len(town.lanes.length))])
+    side = np.where(turn > 0.0, SIGNAL_LEFT, SIGNAL_RIGHT)
+    turns = (np.abs(turn) > junctions.TURN_YAW) & (town.junctions.junction >= 0)
+    return np.where(turns, side, 0)
 
 
 def _atlases(towns: Sequence[Town], seed: int) -> dict[str, np.ndarray]:

@@ -68,7 +68,7 @@ def offsets(towns: Sequence[Town]) -> list[Offsets]:
                 point=last.point + len(town.lanes.point_yaw),
                 light=last.light + len(town.lights.cycle),
                 junction=last.junction + int(town.junctions.junction.max(initial=-1)) + 1,
-                walk=last.walk + len(town.walks.z),
+                walk=last.walk + len(town.walks.xyz),
             )
         )
     return out[:-1]

@@ -37,16 +37,14 @@ class WalkGraph:
     """A town's walk graph; every edge is there in both directions.
 
     Attributes:
-      xy: (n, 2) float64 m.
-      z: (n,) m, height of the nearest lane.
+      xyz: (n, 3) float64 m; z is the height of the nearest lane.
       neighbours: (n, D) int, -1 pads.
       yaw: (n, D) rad, direction of each edge.
       kind: (n, D) int, WALK_* of each edge.
       is_kerb: (n,) bool, a way across begins here.
     """
 
-    xy: np.ndarray
-    z: np.ndarray
+    xyz: np.ndarray
     neighbours: np.ndarray
     yaw: np.ndarray
     kind: np.ndarray
@@ -74,7 +72,7 @@ def build(network: RoadNetwork, table: LaneTable) -> WalkGraph:
     """
     pavements = Pavements(network)
     if not pavements.strips:
-        return _table(np.zeros((0, 3)), np.zeros(0), [], 0)
+        return _table(np.zeros((0, 3)), [], 0)
     road = Road(table)
     across = ways(network, pavements, road)
     draft, joints = _along(pavements.strips, across)
@@ -84,7 +82,8 @@ def build(network: RoadNetwork, table: LaneTable) -> WalkGraph:
     for way, (first, second) in zip(across, joints, strict=True):
         _across(draft, way, first, second, pavements)
     xyz = np.array(draft.xyz)
-    return _table(xyz, road.height(xyz), draft.edges, num_pavement)
+    xyz[:, 2] = road.height(xyz)
+    return _table(xyz, draft.edges, num_pavement)
 
 
 def respawn_table(
@@ -102,7 +101,7 @@ def respawn_table(
       (Gy, Gx, C) int, -1 pads.
     """
     nodes = np.flatnonzero(~graph.is_kerb)
-    places = spawn.Places(nodes, np.zeros(len(nodes)), graph.xy[nodes])
+    places = spawn.Places(nodes, np.zeros(len(nodes)), graph.xyz[nodes, :2])
     return spawn.respawn_table(places, origin, extent, seed, RING)[0]
 
 
@@ -191,9 +190,7 @@ def _across(draft: _Draft, way: Way, first: int, second: int, pavements: Pavemen
     ]
 
 
-def _table(
-    xyz: np.ndarray, z: np.ndarray, edges: list[tuple[int, int, int, int]], num_pavement: int
-) -> WalkGraph:
+def _table(xyz: np.ndarray, edges: list[tuple[int, int, int, int]], num_pavement: int) -> WalkGraph:
     """Rows of neighbours from a list of edges."""
     both = sorted([(a, b, k) for a, b, k, _ in edges] + [(b, a, back) for a, b, _, back in edges])
     degree = np.bincount([a for a, _, _ in both], minlength=len(xyz)).astype(int)
@@ -209,4 +206,4 @@ def _table(
         neighbours[a, column], kind[a, column] = b, edge_kind
         yaw[a, column] = np.arctan2(offset[1], offset[0])
     is_kerb = np.arange(len(xyz)) >= num_pavement
-    return WalkGraph(xyz[:, :2], z, neighbours, yaw, kind, is_kerb)
+    return WalkGraph(xyz, neighbours, yaw, kind, is_kerb)
