@@ -86,7 +86,12 @@ def environment(
       The environment.
     """
     bank = episodes.make_bank(
-        loaded, num_routes, config.env.population, seed, config.env.route_length
+        loaded,
+        num_routes,
+        config.env.population,
+        seed,
+        config.env.route_length,
+        config.env.scenario_spacing,
     )
     return make_env(bank, config.env, config.reward)
 

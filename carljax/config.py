@@ -106,6 +106,11 @@ class TrainConfig:
           ConfigError: in one line, the field and what is wrong with it.
         """
         self.run.validate()
+        spacing = self.env.scenario_spacing
+        if spacing is not None and not spacing >= 0.0:
+            raise ConfigError(
+                f"env.scenario_spacing: {spacing} is below the least allowed, 0 (no scenarios)"
+            )
         try:
             self.ppo.validate(num_devices)
         except ValueError as error:

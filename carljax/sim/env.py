@@ -55,6 +55,8 @@ class EnvConfig:
     """Most scenarios in play at once."""
     route_length: float = 1000.0
     """Length of a route, m. source: paper, Scenario Generation"""
+    scenario_spacing: float | None = 100.0
+    """Metres of route for each scenario; None or 0 for none. source: paper, Scenario Generation"""
     raster: RasterConfig = dataclasses.field(default_factory=RasterConfig)
     """The bird's-eye view image."""
 

@@ -20,6 +20,7 @@ from carljax.sim.population import Population, no_walkers, nobody
 from carljax.sim.road_map import RoadMap
 from carljax.sim.route import Route
 from carljax.sim.route_assembly import RouteSizes
+from carljax.sim.scenarios import generator
 from carljax.sim.scenarios.script import Scenario
 from carljax.sim.town import Town, offsets
 from carljax.sim.types import Agents, Walkers
@@ -61,6 +62,7 @@ def make_bank(
     population: Population,
     seed: int,
     route_length: float = 1000.0,
+    scenario_spacing: float | None = None,
 ) -> EpisodeBank:
     """Draws episodes, the same number in every town (as evenly as it goes).
 
@@ -70,6 +72,7 @@ def make_bank(
       population: how many of each kind of road user there is room for.
       seed: of everything drawn; other seeds give other routes.
       route_length: m.
+      scenario_spacing: m of route for each scenario; None or 0 for none.
 
     Returns:
       The bank.
@@ -77,11 +80,17 @@ def make_bank(
     Raises:
       RouteError: a town has no route of that length.
     """
-    journeys = draw_journeys(towns, num_episodes, seed, route_length)
+    journeys = draw_journeys(towns, num_episodes, seed, route_length, scenario_spacing)
     return populate(towns, journeys, population, seed)
 
 
-def draw_journeys(towns: Sequence[Town], num: int, seed: int, route_length: float) -> list[Journey]:
+def draw_journeys(
+    towns: Sequence[Town],
+    num: int,
+    seed: int,
+    route_length: float,
+    scenario_spacing: float | None,
+) -> list[Journey]:
     """Draws routes and what happens on them, town by town in turn.
 
     Args:
@@ -89,6 +98,7 @@ def draw_journeys(towns: Sequence[Town], num: int, seed: int, route_length: floa
       num: how many.
       seed: see `make_bank`.
       route_length: m.
+      scenario_spacing: see `make_bank`.
 
     Returns:
       The journeys, in the tables that the towns share.
@@ -102,8 +112,13 @@ def draw_journeys(towns: Sequence[Town], num: int, seed: int, route_length: floa
     for number in range(num):
         town = number % len(towns)
         rng = np.random.default_rng([seed, number])
-        route = route_generator.draw(towns[town], firsts[town], route_length, sizes, rng)
-        journeys.append(Journey(route))
+        there, first = towns[town], firsts[town]
+        route = route_generator.draw(there, first, route_length, sizes, rng)
+        if scenario_spacing:
+            scenarios = generator.place_along(there, first, route, rng, scenario_spacing)
+            journeys.append(Journey(route, scenarios))
+        else:
+            journeys.append(Journey(route))
     return journeys
 
 
