@@ -1,7 +1,8 @@
 """One moment of an episode as a picture: where the ego is, what the policy sees and does.
 
-Left the town from above, north up, with route and agents; right the bird's-eye image that is the
-policy's input; below speed, action and the reward's terms by name. NumPy and Pillow on the host.
+Left the town from above, north up, with route and agents (those of scenarios outlined); right the
+bird's-eye image that is the policy's input; below speed, action, the reward's terms and scenarios
+by name. NumPy and Pillow on the host.
 """
 
 from __future__ import annotations
@@ -19,6 +20,8 @@ from carljax.sim import lights
 from carljax.sim.env import DrivingEnv
 from carljax.sim.raster_canvas import RasterConfig
 from carljax.sim.road_map import PIXELS_PER_METRE, RoadMap
+from carljax.sim.scenarios import registry
+from carljax.sim.scenarios.script import ScenarioSlots
 from carljax.sim.types import (
     KIND_PEDESTRIAN,
     KIND_STATIC,
@@ -35,13 +38,13 @@ from carljax.sim.types import (
 MAP_SIDE_M = 140.0
 PANEL = 320  # px, side of both pictures
 MARGIN = 8
-TEXT_HEIGHT = 150
+TEXT_HEIGHT = 168
 ROW = 18  # px, line of text
 
 BACKGROUND, TEXT, DIM = (24, 26, 30), (232, 232, 228), (110, 114, 120)
 AHEAD, STOP = (86, 156, 255), (226, 226, 214)
 GOOD, BAD = (98, 190, 120), (226, 92, 82)
-EGO = (255, 196, 57)
+EGO, SCENARIO = (255, 196, 57), (255, 64, 200)
 AGENT_COLOURS = {
     KIND_VEHICLE: (205, 214, 226),
     KIND_PEDESTRIAN: (255, 200, 90),
@@ -61,6 +64,8 @@ class World:
       route_yaw: (R,) rad.
       stop_idx, stop_kind, stop_light, stop_width: (Q,) of the route's stop lines.
       road_map: all towns, on the device.
+      scenario_kind: (E,) int32, places in `registry.KINDS`, of the route's scenarios.
+      actors: rows of `Agents` that belong to scenarios.
       ego_size: length and width, m.
     """
 
@@ -73,6 +78,8 @@ class World:
     stop_light: np.ndarray
     stop_width: np.ndarray
     road_map: RoadMap
+    scenario_kind: np.ndarray
+    actors: slice
     ego_size: tuple[float, float]
 
 
@@ -80,7 +87,7 @@ def read_world(env: DrivingEnv, episode_idx: int) -> World:
     """Fetches the town and the route of an episode from the device."""
     routes, road_map = env.bank.routes, env.bank.road_map
     route = jax.device_get(jax.tree.map(lambda x: x[episode_idx], routes))
-    town = int(route.town)
+    town, rows = int(route.town), env.config.population
     return World(
         layers=np.asarray(road_map.layers[town]),
         origin=np.asarray(road_map.origin[town]),
@@ -91,6 +98,8 @@ def read_world(env: DrivingEnv, episode_idx: int) -> World:
         stop_light=route.stop_light,
         stop_width=route.stop_width,
         road_map=road_map,
+        scenario_kind=np.asarray(env.bank.scenarios.kind[episode_idx]),
+        actors=slice(rows.cars.start, rows.others.stop),
         ego_size=(float(env.vehicle.length), float(env.vehicle.width)),
     )
 
@@ -112,7 +121,9 @@ def frame(env: DrivingEnv, world: World, state: State, command: np.ndarray) -> I
     canvas.paste(map_view(world, state), (MARGIN, MARGIN))
     seen = policy_view(np.asarray(state.obs.raster), env.config.raster)
     canvas.paste(seen, (PANEL + 2 * MARGIN + (PANEL - seen.width) // 2, MARGIN))
-    _draw_numbers(ImageDraw.Draw(canvas), state, command, PANEL + 2 * MARGIN)
+    draw = ImageDraw.Draw(canvas)
+    _draw_numbers(draw, state, command, PANEL + 2 * MARGIN)
+    _draw_scenarios(draw, world, state, PANEL + 2 * MARGIN)
     return canvas
 
 
@@ -146,9 +157,13 @@ def map_view(world: World, state: State) -> Image.Image:
             draw.line(pixels(_stop_line(world, q)), fill=colour, width=3)
     agents = sim.agents
     poses = np.column_stack([agents.xy, agents.yaw, agents.length, agents.width])
+    is_actor = np.zeros(len(poses), bool)
+    is_actor[world.actors] = True
     for kind, colour in AGENT_COLOURS.items():
-        for x, y, *rest in poses[np.asarray(agents.kind) == kind]:
-            draw.polygon(pixels(_corners(np.array([x, y]), *rest)), fill=colour)
+        for n in np.flatnonzero(np.asarray(agents.kind) == kind):
+            x, y, *rest = poses[n]
+            outline = SCENARIO if is_actor[n] else colour
+            draw.polygon(pixels(_corners(np.array([x, y]), *rest)), fill=colour, outline=outline)
     draw.polygon(pixels(_corners(centre, float(sim.ego.yaw), *world.ego_size)), fill=EGO)
     return view
 
@@ -218,6 +233,22 @@ def _draw_numbers(draw: ImageDraw.ImageDraw, state: State, command: np.ndarray, 
     if names:
         text = f"the end: {names}" if float(state.done) > 0 else names
         draw.text((MARGIN, top + ROW * 6 + 6), text.replace("_", " "), BAD, font)
+
+
+def scenario_names(world: World, slots: ScenarioSlots) -> list[str]:
+    """Names of the scenarios whose actors are about; those that play are marked."""
+    index, playing = np.asarray(slots.index), np.asarray(slots.is_playing)
+    kinds = [int(world.scenario_kind[i]) for i in index[index >= 0]]
+    names = [registry.KINDS[kind] for kind in kinds]
+    return [f"> {n} <" if p else n for n, p in zip(names, playing[index >= 0], strict=True)]
+
+
+def _draw_scenarios(draw: ImageDraw.ImageDraw, world: World, state: State, top: int) -> None:
+    """Names the scenarios at the bottom right."""
+    names = scenario_names(world, state.pipeline_state.scenarios)
+    for row, name in enumerate(names):
+        y = top + ROW * (len(SOFT_FACTORS) + row) + 4
+        draw.text((360, y), name, SCENARIO, ImageFont.load_default(size=13))
 
 
 def _bar(
