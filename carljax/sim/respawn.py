@@ -5,7 +5,7 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 
-from carljax.sim import geometry, traffic, vehicles
+from carljax.sim import geometry, lane_plan, traffic, vehicles
 from carljax.sim.right_of_way import BRAKING, planned_lane
 from carljax.sim.road_map import RoadMap, pose_at
 from carljax.sim.types import Agents, EgoState
@@ -54,7 +54,7 @@ def respawn(
     moves = (jnp.arange(gone.shape[0]) == chosen) & gone & hidden & clear & (lane >= 0)
     one = jnp.maximum(lane, 0)[None]
     model, length, width = vehicles.draw(one, jnp.float32([SPAWN_GAP]), road_map, key_model)
-    lanes = traffic.plan(one, model, road_map, key_plan)
+    lanes = lane_plan.plan(one, model, road_map, key_plan)
     limit = jnp.minimum(
         road_map.lane_speed_limit[lanes[0, 0]], road_map.lane_curve_speed[lanes[0, 0]]
     )

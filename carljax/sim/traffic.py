@@ -11,8 +11,9 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 
-from carljax.sim import geometry, idm, population, vehicles
+from carljax.sim import geometry, idm, indicators, lane_change, lane_shift, population, vehicles
 from carljax.sim.idm import IDMParams
+from carljax.sim.lane_plan import next_lane, plan
 from carljax.sim.right_of_way import (
     BRAKING,
     EgoPlace,
@@ -66,6 +67,10 @@ def step(
     stop = stop_ahead(agents, road_map, clock)
     movers = all_movers(agents, stop, ego, ego_length, ego_place, road_map, clock)
     accel = accelerations(agents, stop, movers, ego, ego_length, road_map, params)
+    key_change, key_plan = jax.random.split(key)
+    agents = lane_change.begin(
+        agents, movers, desired_speed(agents, road_map), road_map, params, key_change
+    )
     speed = jnp.maximum(agents.speed + accel * dt, 0.0)
     travelled = 0.5 * (agents.speed + speed) * dt
     moved = agents.replace(
@@ -75,14 +80,20 @@ def step(
         wait_s=jnp.where(speed < 0.1, agents.wait_s + dt, 0.0),
         has_stopped=has_stopped(agents, stop, speed),
     )
-    return place(_follow_plan(moved, road_map, key), road_map)
+    moved = lane_shift.move(moved, travelled, road_map)
+    moved = place(_follow_plan(moved, road_map, key_plan), road_map)
+    return moved.replace(signals=indicators.signals(moved, road_map))
 
 
 def place(agents: Agents, road_map: RoadMap) -> Agents:
-    """Fills in xy, z, yaw and yaw rate from lane and arc length."""
+    """Fills in xy, z, yaw and yaw rate from lane, arc length and offset."""
     pose = pose_at(road_map, jnp.maximum(agents.lanes[:, 0], 0), agents.lane_s)
+    side = jnp.stack([-jnp.sin(pose.yaw), jnp.cos(pose.yaw)], axis=-1)
     return agents.replace(
-        xy=pose.xy, z=pose.z, yaw=pose.yaw, yaw_rate=agents.speed * pose.curvature
+        xy=pose.xy + agents.lateral[:, None] * side,
+        z=pose.z,
+        yaw=geometry.wrap_angle(pose.yaw + jnp.arctan(lane_shift.slope(agents))),
+        yaw_rate=agents.speed * pose.curvature,
     )
 
 
@@ -98,6 +109,7 @@ def accelerations(
     """(N,) m/s^2: the hardest braking that any leader, line or junction asks for."""
     desired = desired_speed(agents, road_map)
     gap, leader_speed = leaders(agents, movers, road_map)
+    change_gap, change_speed = lane_shift.leaders(agents, movers, road_map)
     ego_gap = corridor_gap(agents, ego, ego_length)
     line = jnp.where(must_stop(agents, stop), stop.distance - STOP_MARGIN, FAR)
     gate = jnp.where(gated(agents, movers, road_map), movers.entry[:-1] - STOP_MARGIN, FAR)
@@ -107,7 +119,8 @@ def accelerations(
     def respond(gap: jax.Array, leader_speed: jax.Array) -> jax.Array:
         return idm.acceleration(agents.speed, gap, leader_speed, desired, params)
 
-    accel = jnp.minimum(respond(gap, leader_speed), respond(ego_gap, ego.speed))
+    accel = jnp.minimum(respond(gap, leader_speed), respond(change_gap, change_speed))
+    accel = jnp.minimum(accel, respond(ego_gap, ego.speed))
     accel = jnp.minimum(accel, respond(still, jnp.zeros_like(still)))
     return jnp.where(agents.valid, accel, 0.0)
 
@@ -115,7 +128,8 @@ def accelerations(
 def desired_speed(agents: Agents, road_map: RoadMap) -> jax.Array:
     """(N,) m/s: the limit, slower in bends and early enough before them."""
     lane, following = planned_lane(agents, 0), planned_lane(agents, 1)
-    limit = road_map.lane_speed_limit[lane] * agents.desired_speed_frac
+    cap = vehicles.speed_cap(agents.model)
+    limit = jnp.minimum(road_map.lane_speed_limit[lane] * agents.desired_speed_frac, cap)
     here = jnp.minimum(limit, road_map.lane_curve_speed[lane])
     there = jnp.minimum(
         road_map.lane_speed_limit[following] * agents.desired_speed_frac,
@@ -175,34 +189,6 @@ def _follow_plan(agents: Agents, road_map: RoadMap, key: jax.Array) -> Agents:
             lane_s=jnp.where(over, agents.lane_s - length, agents.lane_s),
         )
     return agents
-
-
-def next_lane(lane: jax.Array, model: jax.Array, road_map: RoadMap, key: jax.Array) -> jax.Array:
-    """(N,) int32, a successor of each lane drawn uniformly from those that suit; -1 at dead ends.
-
-    Args:
-      lane: (N,) int32, -1 for none.
-      model: (N,) int32, class of the vehicle that will drive there.
-      road_map: the map.
-      key: PRNG key.
-    """
-    successors = road_map.lane_successors[jnp.maximum(lane, 0)]  # (N, F)
-    there = successors >= 0
-    suited = there & vehicles.suits(model[:, None], jnp.maximum(successors, 0), road_map)
-    open_to = jnp.where(suited.any(axis=1, keepdims=True), suited, there)
-    number = jnp.cumsum(open_to, axis=1)  # of each, from 1
-    drawn = jax.random.uniform(key, lane.shape) * number[:, -1]
-    drawn = jnp.argmax(open_to & (number > drawn[:, None]), axis=1)
-    chosen = jnp.take_along_axis(successors, drawn[:, None], axis=1)[:, 0]
-    return jnp.where(lane >= 0, chosen, -1)
-
-
-def plan(lane: jax.Array, model: jax.Array, road_map: RoadMap, key: jax.Array) -> jax.Array:
-    """(N, 3) int32, a plan that begins with the given lanes."""
-    key_second, key_third = jax.random.split(key)
-    second = next_lane(lane, model, road_map, key_second)
-    third = next_lane(second, model, road_map, key_third)
-    return jnp.stack([lane, second, third], axis=1)
 
 
 def initial(

@@ -1,0 +1,264 @@
+"""Lane changes of traffic: whether one pays and is safe.
+
+The decision is MOBIL's: what the car gains in acceleration, and what it costs the two cars behind.
+source: Kesting, Treiber, Helbing, General lane-changing model MOBIL for car-following models
+(2007). A car whose lane ends changes as soon as that is safe. In each step a few cars look to one
+side and at most one begins to change, so that two never take the same gap. `lane_shift` then moves
+it across.
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+from carljax.sim import geometry, idm, vehicles
+from carljax.sim.idm import IDMParams
+from carljax.sim.lane_plan import plan
+from carljax.sim.lane_shift import AT_ONCE, FAR, with_leaving
+from carljax.sim.right_of_way import Mover, planned_lane
+from carljax.sim.road_map import RoadMap
+from carljax.sim.types import Agents
+
+POLITENESS = 0.2  # weight of the others' loss. source: Kesting et al.: realistic from 0.2 to 0.5
+THRESHOLD = 0.2  # m/s^2 to be gained. source: Treiber's page on MOBIL; 0.1 in the paper
+# m/s^2, hardest braking that the new follower is put to, and the car itself. source: Kesting et al.
+SAFE_BRAKING = 4.0
+# m/s^2 for the sake of a better lane only. source: ours, so that nobody is cut off without need
+POLITE_BRAKING = 2.0
+MIN_GAP = 1.5  # m to either side. source: ours
+
+TRIES = 8  # cars that look beside in a step: each one about twice a second. source: ours
+LEAVES_FROM = 10.0  # m after a lane's beginning: no changes on the way out of a junction
+ROOM, ROOM_TIME = 20.0, 3.5  # m and s at the present speed that a change needs before a junction
+LANE_ENDS = 150.0  # m before its end a lane is left. source: ours, about where signs warn
+
+
+class Gaps(struct.PyTreeNode):
+    """Whom a place on a lane has before and behind it, (M,).
+
+    Attributes:
+      ahead, behind: m between bumpers, FAR where there is nobody.
+      leader_speed, follower_speed: m/s.
+      follower: int32, row of `Mover`.
+    """
+
+    ahead: jax.Array
+    behind: jax.Array
+    leader_speed: jax.Array
+    follower_speed: jax.Array
+    follower: jax.Array
+
+
+class Change(struct.PyTreeNode):
+    """Where cars would come by a change: lanes (M, 3) int32, s (M,) m, lateral (M,) m."""
+
+    lanes: jax.Array
+    s: jax.Array
+    lateral: jax.Array
+    possible: jax.Array
+
+
+def begin(
+    agents: Agents,
+    movers: Mover,
+    desired: jax.Array,
+    road_map: RoadMap,
+    params: IDMParams,
+    key: jax.Array,
+) -> Agents:
+    """Lets at most one car begin to change lanes.
+
+    Args:
+      agents: (N,) vehicles.
+      movers: (N + 1,) the same as others see them, and the ego.
+      desired: (N,) m/s, free speed of each.
+      road_map: the map.
+      params: of a car's driver.
+      key: PRNG key.
+
+    Returns:
+      The agents; one of them may be on the lane beside, its body where it was.
+    """
+    num = agents.lane_s.shape[0]
+    key_row, key_side, key_plan = jax.random.split(key, 3)
+    tries = min(TRIES, num)
+    rows = (jax.random.randint(key_row, (), 0, num) + jnp.arange(tries)) % num
+    cars = jax.tree.map(lambda x: x[rows], agents)
+    to_left = jax.random.bernoulli(key_side, shape=(tries,))
+    change = beside(cars, to_left, road_map, key_plan)
+    gain, safe = judge(rows, change, agents, movers, desired, road_map, params)
+    must = _ends(cars.lanes, cars.lane_s, road_map)
+    worse = _ends(change.lanes, change.s, road_map) & ~must
+    wanted = change.possible & ~worse & (must | (gain > THRESHOLD)) & safe
+    wanted &= (agents.from_lane >= 0).sum() < AT_ONCE
+    best = jnp.argmax(jnp.where(wanted, gain + jnp.where(must, 100.0, 0.0), -FAR))
+    is_row = (jnp.arange(num) == rows[best]) & wanted[best]
+    return agents.replace(
+        lanes=jnp.where(is_row[:, None], change.lanes[best], agents.lanes),
+        lane_s=jnp.where(is_row, change.s[best], agents.lane_s),
+        lateral=jnp.where(is_row, change.lateral[best], agents.lateral),
+        from_lane=jnp.where(is_row, agents.lanes[:, 0], agents.from_lane),
+        from_s=jnp.where(is_row, agents.lane_s, agents.from_s),
+    )
+
+
+def beside(cars: Agents, to_left: jax.Array, road_map: RoadMap, key: jax.Array) -> Change:
+    """The place beside each car, and whether a change may begin there.
+
+    Args:
+      cars: (M,) vehicles.
+      to_left: (M,) bool.
+      road_map: the map.
+      key: PRNG key, of the new plans.
+    """
+    lane = planned_lane(cars, 0)
+    spacing = road_map.lane_length[lane] / (road_map.lane_num_points[lane] - 1)
+    number = jnp.round(cars.lane_s / spacing).astype(jnp.int32)
+    point = road_map.lane_start[lane] + jnp.clip(number, 0, road_map.lane_num_points[lane] - 1)
+    there = jnp.where(to_left, road_map.point_left[point], road_map.point_right[point])
+    exists = there >= 0
+    there = jnp.maximum(there, 0)
+    new_lane = road_map.point_lane[there]
+    offset = geometry.to_frame(cars.xy, road_map.point_xy[there], road_map.point_yaw[there])
+    new_spacing = road_map.lane_length[new_lane] / (road_map.lane_num_points[new_lane] - 1)
+    s = (there - road_map.lane_start[new_lane]) * new_spacing + offset[:, 0]
+    lanes = plan(new_lane, cars.model, road_map, key)
+    free = cars.valid & ~cars.is_lawless & ~cars.is_braking_hard & (cars.from_lane < 0)
+    room = jnp.maximum(ROOM, ROOM_TIME * cars.speed)
+    here = _has_room(cars.lanes, cars.lane_s, room, road_map)
+    return Change(
+        lanes=lanes,
+        s=s,
+        lateral=offset[:, 1],
+        possible=exists & free & here & _has_room(lanes, s, room, road_map),
+    )
+
+
+def _has_room(lanes: jax.Array, s: jax.Array, room: jax.Array, road_map: RoadMap) -> jax.Array:
+    """(M,) bool: neither a lane's end, if it goes on there, nor a stop line is near."""
+    lane = jnp.maximum(lanes[:, 0], 0)
+    left = road_map.lane_length[lane] - s
+    line = road_map.lane_stop_s[lane] - s
+    at_line = (road_map.lane_stop_kind[lane] > 0) & (line > 0.0) & (line < room)
+    return (s > LEAVES_FROM) & ((left > room) | (lanes[:, 1] < 0)) & ~at_line
+
+
+def _ends(lanes: jax.Array, s: jax.Array, road_map: RoadMap) -> jax.Array:
+    """(M,) bool: the way ends within LANE_ENDS."""
+    lengths = road_map.lane_length[jnp.maximum(lanes[:, :2], 0)]
+    left = lengths[:, 0] - s
+    left = left + jnp.where(lanes[:, 1] >= 0, lengths[:, 1], 0.0)
+    return (lanes[:, 1:] < 0).any(axis=1) & (left < LANE_ENDS)
+
+
+def judge(
+    rows: jax.Array,
+    change: Change,
+    agents: Agents,
+    movers: Mover,
+    desired: jax.Array,
+    road_map: RoadMap,
+    params: IDMParams,
+) -> tuple[jax.Array, jax.Array]:
+    """MOBIL's two criteria.
+
+    Args:
+      rows: (M,) int32, those that think of a change.
+      change: (M,) where they would come.
+      agents: (N,) all vehicles.
+      movers: (N + 1,) the same as others see them, and the ego.
+      desired: (N,) m/s, free speed of each.
+      road_map: the map.
+      params: of a car's driver.
+
+    Returns:
+      (M,) m/s^2 gained by the car, and in part by those behind it; (M,) bool, nobody has to brake
+      too hard for it.
+    """
+    cars = jax.tree.map(lambda x: x[rows], agents)
+    seen = with_leaving(movers, agents)
+    length = cars.length
+    old = gaps(cars.lanes, cars.lane_s, length, rows, seen, road_map)
+    new = gaps(change.lanes, change.s, length, rows, seen, road_map)
+    limit = road_map.lane_speed_limit[jnp.maximum(change.lanes[:, 0], 0)]
+    old_limit = road_map.lane_speed_limit[planned_lane(cars, 0)]
+    own = vehicles.driver(cars.model, params)
+    stays = idm.acceleration(cars.speed, old.ahead, old.leader_speed, desired[rows], own)
+    there = desired[rows] * limit / old_limit
+    goes = idm.acceleration(cars.speed, new.ahead, new.leader_speed, there, own)
+
+    # The ego, and a car that is leaving its lane, count as cars that drive at the limit or faster.
+    num = agents.lane_s.shape[0]
+
+    def follower_accel(side: Gaps, gap: jax.Array, leader_speed: jax.Array) -> jax.Array:
+        is_agent, row = side.follower < num, jnp.minimum(side.follower, num - 1)
+        model = jnp.where(is_agent, agents.model[row], vehicles.CAR)
+        free = jnp.maximum(side.follower_speed, limit)
+        free = jnp.where(is_agent, desired[row], free)
+        driver = vehicles.driver(model, params)
+        return idm.acceleration(side.follower_speed, gap, leader_speed, free, driver)
+
+    whole = new.behind + length + new.ahead
+    behind_now = follower_accel(new, whole, new.leader_speed)
+    behind_then = follower_accel(new, new.behind, cars.speed)
+    left_now = follower_accel(old, old.behind, cars.speed)
+    left_then = follower_accel(old, old.behind + length + old.ahead, old.leader_speed)
+    others = jnp.where(new.behind < FAR, behind_then - behind_now, 0.0)
+    others += jnp.where(old.behind < FAR, left_then - left_now, 0.0)
+    must = _ends(cars.lanes, cars.lane_s, road_map)
+    bound = -jnp.where(must, SAFE_BRAKING, POLITE_BRAKING)
+    safe = (new.ahead > MIN_GAP) & (new.behind > MIN_GAP) & (goes > bound)
+    safe &= (behind_then > bound) | (new.behind >= FAR)
+    return goes - stays + POLITENESS * others, safe
+
+
+def gaps(
+    lanes: jax.Array,
+    s: jax.Array,
+    length: jax.Array,
+    itself: jax.Array,
+    movers: Mover,
+    road_map: RoadMap,
+) -> Gaps:
+    """Whom a place on a lane has before and behind it; those exactly beside count as behind.
+
+    Args:
+      lanes: (M, 3) int32, the lane and the two after it.
+      s: (M,) m on the first.
+      length: (M,) m, of the vehicle that is or would be there.
+      itself: (M,) int32, row of that vehicle among the movers.
+      movers: (N,) everybody.
+      road_map: the map.
+    """
+    is_other = jnp.arange(movers.lane.shape[0]) != itself[:, None]
+    lane, other_s = jnp.where(is_other, movers.lane[None, :], -1), movers.s[None, :]
+    to_next = (road_map.lane_length[jnp.maximum(lanes[:, 0], 0)] - s)[:, None]
+    to_third = to_next + road_map.lane_length[jnp.maximum(lanes[:, 1], 0)][:, None]
+    on_first = (lane == lanes[:, :1]) & (lane >= 0)
+    on_next = (lane == lanes[:, 1:2]) & (lane >= 0)
+    on_third = (lane == lanes[:, 2:]) & (lane >= 0)
+    offset = other_s - s[:, None]
+    ahead = jnp.where(on_first & (offset > 0.0), offset, FAR)
+    ahead = jnp.minimum(ahead, jnp.where(on_next, to_next + other_s, FAR))
+    ahead = jnp.minimum(ahead, jnp.where(on_third, to_third + other_s, FAR))
+    # From the middle of the place to that of whoever drives up to it.
+    arrives = (movers.next_lane[None, :] == lanes[:, :1]) & (lane >= 0)
+    until = s[:, None] + movers.entry[None, :] + movers.half_length[None, :]
+    behind = jnp.where(on_first & (offset <= 0.0), -offset, jnp.where(arrives, until, FAR))
+    half = 0.5 * length[:, None] + movers.half_length[None, :]
+    ahead, behind = ahead - half, behind - half
+    first, last = jnp.argmin(ahead, axis=1), jnp.argmin(behind, axis=1)
+
+    def at(values: jax.Array, row: jax.Array) -> jax.Array:
+        return jnp.take_along_axis(values, row[:, None], axis=1)[:, 0]
+
+    nearest, follows = at(ahead, first), at(behind, last)
+    return Gaps(
+        ahead=jnp.where(nearest < 0.5 * FAR, nearest, FAR),
+        behind=jnp.where(follows < 0.5 * FAR, follows, FAR),
+        leader_speed=movers.speed[first],
+        follower_speed=movers.speed[last],
+        follower=last,
+    )
