@@ -2,7 +2,7 @@
 
 One environment, unbatched; `vmap` goes above. Order of a step: the ego moves by the action, traffic
 moves by its own rules, one far-away car may be used again nearby, the clock of the lights goes on,
-scenarios are played; then the reward looks at where everything is now.
+scenarios are played, pedestrians walk; then the reward looks at where everything is now.
 """
 
 from __future__ import annotations
@@ -15,7 +15,17 @@ from flax import struct
 
 from carljax.reward import reward
 from carljax.reward.config import RewardConfig
-from carljax.sim import bicycle, lights, population, respawn, route, situation, spawn, traffic
+from carljax.sim import (
+    bicycle,
+    lights,
+    pedestrians,
+    population,
+    respawn,
+    route,
+    situation,
+    spawn,
+    traffic,
+)
 from carljax.sim.bicycle import VehicleParams
 from carljax.sim.episodes import EpisodeBank
 from carljax.sim.idm import IDMParams
@@ -27,12 +37,14 @@ from carljax.sim.route import Route
 from carljax.sim.scenarios import engine, script
 from carljax.sim.scenarios.actors import Scene
 from carljax.sim.types import (
+    Agents,
     EgoState,
     LightClock,
     RewardTerms,
     SimState,
     Situation,
     State,
+    Walkers,
 )
 
 ACTION_SIZE = 2
@@ -154,7 +166,7 @@ class DrivingEnv(struct.PyTreeNode):
     def advance(self, state: State, action: jax.Array) -> State:
         """Returns what `step` does, without the observation."""
         before = state.pipeline_state
-        key, key_traffic, key_respawn, key_scenarios = jax.random.split(before.key, 4)
+        key, key_traffic, key_respawn, key_scenarios, key_walk = jax.random.split(before.key, 5)
         dt, road_map = self.config.dt, self.bank.road_map
         stretch, first = route.window(self.bank.routes, before.episode_idx, before.route_idx)
         idx = before.route_idx - first
@@ -198,6 +210,7 @@ class DrivingEnv(struct.PyTreeNode):
             key_scenarios,
             dt,
         )
+        agents, walkers = self._walk(agents, before.walkers, ego, stretch.town, key_walk)
         seen = self._situation(ego, stretch, first, idx, clock)
         paid, terminated, memory, terms = reward.compute(
             before, ego, agents, seen, self.vehicle, self.reward_config, dt
@@ -207,6 +220,7 @@ class DrivingEnv(struct.PyTreeNode):
             agents=agents,
             reward_state=memory,
             route_idx=seen.route_idx,
+            walkers=walkers,
             scenarios=slots,
             lights=clock,
             step_count=before.step_count + 1,
@@ -228,6 +242,25 @@ class DrivingEnv(struct.PyTreeNode):
     def observe(self, state: State) -> State:
         """Returns the state with what the policy and the critic see of it."""
         return state.replace(obs=observe(self, state.pipeline_state))
+
+    def _walk(
+        self, agents: Agents, walkers: Walkers, ego: EgoState, town: jax.Array, key: jax.Array
+    ) -> tuple[Agents, Walkers]:
+        """Moves the pedestrians, after everybody else has moved."""
+        rows, road_map = self.config.population, self.bank.road_map
+        if rows.num_walkers == 0:
+            return agents, walkers
+        key_way, key_place = jax.random.split(key)
+        others = population.rows(agents, slice(0, rows.walkers.start))
+        bodies = population.rows(agents, rows.walkers)
+        size = jnp.stack([jnp.float32(self.vehicle.length), jnp.float32(self.vehicle.width)])
+        bodies, walkers = pedestrians.step(
+            bodies, walkers, others, ego, size, road_map, key_way, self.config.dt
+        )
+        bodies, walkers = pedestrians.respawn(
+            bodies, walkers, ego, town, road_map, key_place, spawn.CELL
+        )
+        return population.join(others, bodies), walkers
 
     def _scene(self, ego: EgoState, place: EgoPlace, route_s: jax.Array, is_start: bool) -> Scene:
         return Scene(

@@ -14,9 +14,9 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from carljax.sim import road_map_builder, route_generator, spawn, traffic
+from carljax.sim import crowd, pedestrians, road_map_builder, route_generator, spawn, traffic
 from carljax.sim.journey import Journey, stack_routes, stack_scenarios
-from carljax.sim.population import Population, no_walkers, nobody
+from carljax.sim.population import Population, nobody
 from carljax.sim.road_map import RoadMap
 from carljax.sim.route import Route
 from carljax.sim.route_assembly import RouteSizes
@@ -31,6 +31,7 @@ _AT_START = 1  # keeps the draws of who is there at the start apart from those o
 
 
 _initial = jax.jit(jax.vmap(traffic.initial, in_axes=(0, 0, 0, None, 0)))
+_bodies = jax.jit(jax.vmap(pedestrians.initial, in_axes=(0, None)))
 
 
 class EpisodeBank(struct.PyTreeNode):
@@ -138,12 +139,14 @@ def populate(
     """
     found = [spawn.places(town.lanes) for town in towns]
     firsts = offsets(towns)
-    agents = []
+    agents, crowds = [], []
     for number, journey in enumerate(journeys):
         town = int(journey.route.town)
         rng = np.random.default_rng([seed, number, _AT_START])
         first_lane, most = firsts[town].lane, population.num_traffic
         agents.append(_traffic(towns[town], found[town], first_lane, journey.route, most, rng))
+        start, num_walkers = np.asarray(journey.route.xy[0]), population.num_walkers
+        crowds.append(crowd.draw(towns[town].walks, firsts[town].walk, start, num_walkers, rng))
     lane, s, speed = (np.stack(values) for values in zip(*agents, strict=True))
     road_map = road_map_builder.build(towns)
     num = len(journeys)
@@ -154,12 +157,14 @@ def populate(
         road_map,
         jax.random.split(jax.random.key(seed), num),
     )
-    rest = _repeat(nobody(population.num_agents - population.num_traffic), num)
+    walkers = jax.tree.map(lambda *x: jnp.asarray(np.stack(x)), *crowds)
+    num_rest = population.num_agents - population.num_traffic - population.num_walkers
+    parts = cars, _repeat(nobody(num_rest), num), _bodies(walkers, road_map)
     return EpisodeBank(
         road_map=road_map,
         routes=jax.tree.map(jnp.asarray, stack_routes(journeys)),
-        agents=jax.tree.map(lambda *x: jnp.concatenate(x, axis=1), cars, rest),
-        walkers=_repeat(no_walkers(population.num_walkers), num),
+        agents=jax.tree.map(lambda *x: jnp.concatenate(x, axis=1), *parts),
+        walkers=walkers,
         scenarios=jax.tree.map(jnp.asarray, stack_scenarios(journeys)),
     )
 
