@@ -1,7 +1,7 @@
 """Worlds with one scenario each: real routes in bundled towns, nobody else, scripted egos.
 
-`draws` finds routes with a scenario of a kind on each, `make` puts them into an environment, `drive`
-runs all of them with one driver from shortly before the scenario is armed.
+`draws` finds routes with a scenario of a kind on each, `make` puts them into an environment,
+`drive` runs all of them with one driver from shortly before the scenario is armed.
 """
 
 from __future__ import annotations
