@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import pathlib
 from collections.abc import Sequence
 
@@ -37,6 +38,14 @@ class Town:
     junctions: junctions.JunctionTable
     lights: light_table.LightTable
     walks: walk_graph.WalkGraph
+
+    @functools.cached_property
+    def raw_points(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Points of all lanes as read: xy (n, 2) m, width (n,) m, index into network.lanes (n,)."""
+        lanes = self.network.lanes
+        number = np.repeat(np.arange(len(lanes)), [len(lane.width) for lane in lanes])
+        xy = np.concatenate([lane.xyz[:, :2] for lane in lanes])
+        return xy, np.concatenate([lane.width for lane in lanes]), number
 
 
 @dataclasses.dataclass(frozen=True)

@@ -2,7 +2,8 @@
 
 For each stretch of the route the kinds are shuffled; each gets one try, at a place drawn uniformly
 from the stretch, and the first that suits its place is taken. source: paper, Scenario Generation,
-and the authors' generator.
+and the authors' generator. Here kinds that few places suit go first: some other kind suits every
+place, and in longest6 they are every other scenario.
 """
 
 from __future__ import annotations
@@ -14,19 +15,19 @@ import numpy as np
 from carljax.sim.route import Route
 from carljax.sim.scenarios import registry
 from carljax.sim.scenarios import site as site_module
-from carljax.sim.scenarios.script import Scenario
+from carljax.sim.scenarios.script import DRIVE_LEGAL, Scenario
 from carljax.sim.scenarios.site import Site
 from carljax.sim.town import Offsets, Town
 
 SPACING = 100.0  # m. source: paper, Scenario Generation
 START_ROOM = 20  # route points before the first trigger, so that the ego has set off. source: ours
 END_ROOM = 60  # route points after the last trigger, in which it can play. source: ours
-# m from the trigger to the junction, for kinds that need one: the ego is out of reach of what
-# happens there, and comes while it happens. source: ours
-JUNCTION_AHEAD = (30.0, 70.0)
-AT_JUNCTION = frozenset(
+# m from the trigger to the junction at least, for kinds that need one. source: ours, so that the
+# ego comes while it happens
+JUNCTION_ROOM = 30.0
+# Kinds that few places suit: they need a certain junction, and a certain way through it.
+RARE = frozenset(
     (
-        "VehicleTurningRoute",
         "SignalizedJunctionLeftTurn",
         "SignalizedJunctionRightTurn",
         "NonSignalizedJunctionLeftTurn",
@@ -34,6 +35,7 @@ AT_JUNCTION = frozenset(
         "OppositeVehicleRunningRedLight",
     )
 )
+AT_JUNCTION = RARE | {"VehicleTurningRoute"}
 
 
 def place_along(
@@ -61,13 +63,19 @@ def place_along(
     begins = np.arange(0, max(end, 0), spacing)
     placed: list[Scenario] = []
     for begin, until in zip(begins, np.minimum(begins + spacing, end), strict=True):
-        for name in rng.permutation(len(kinds)):
+        for kind in _order(kinds, rng):
             index = int(rng.integers(int(begin), max(int(until), int(begin) + 1)))
-            found = _try(kinds[name], Site(town, first, route, index), rng)
+            found = _try(kind, Site(town, first, route, index), rng)
             if found is not None and not any(clash(found, other) for other in placed):
                 placed.append(found)
                 break
     return tuple(sorted(placed, key=lambda scenario: float(scenario.arm_s)))
+
+
+def _order(kinds: Sequence[str], rng: np.random.Generator) -> list[str]:
+    """The kinds shuffled, rare ones first."""
+    shuffled = [kinds[i] for i in rng.permutation(len(kinds))]
+    return sorted(shuffled, key=lambda kind: kind not in RARE)
 
 
 def _try(kind: str, site: Site, rng: np.random.Generator) -> Scenario | None:
@@ -76,20 +84,21 @@ def _try(kind: str, site: Site, rng: np.random.Generator) -> Scenario | None:
         return None
     if kind in AT_JUNCTION:
         crossing = site_module.next_junction(site)
-        least, most = JUNCTION_AHEAD
-        if crossing is None or not least <= crossing.entry_s - site.trigger_s <= most:
+        if crossing is None or crossing.entry_s - site.trigger_s < JUNCTION_ROOM:
             return None
     return registry.place(kind, site, rng)
 
 
 def clash(one: Scenario, other: Scenario) -> bool:
-    """Whether two scenarios are in play at once while one holds lights or has cars on the lanes.
+    """Whether two scenarios play at once while one holds lights or has cars that wait for nobody.
 
-    So no scenario holds a junction that another uses, and no stream drives into another's cars.
+    So none holds a junction that another uses, and no stream drives into what another does.
     """
-    together = one.arm_s <= other.end_s and other.arm_s <= one.end_s
+    together = one.trigger_s <= other.end_s and other.trigger_s <= one.end_s
     return bool(together and (_needs_road(one) or _needs_road(other)))
 
 
 def _needs_road(scenario: Scenario) -> bool:
-    return bool(scenario.held_junction >= 0 or (scenario.cars.model >= 0).any())
+    cars = scenario.cars
+    is_lawless = (cars.model >= 0) & (cars.drive != DRIVE_LEGAL)
+    return bool(scenario.held_junction >= 0 or is_lawless.any())

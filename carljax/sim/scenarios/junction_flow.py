@@ -31,6 +31,9 @@ OUT_OF_SIGHT = 65.0
 SHORTEST_ARM = 45.0  # m; a shorter arm brings its cars into sight too suddenly. source: ours
 ARM_CLEARANCE = 4.0  # m kept to an arm's beginning. source: ours
 FARTHEST_SINK = 90.0  # m beyond the junction, out of sight. source: ours
+# m from the trigger to the junction where the site is farther away: the ego comes while it happens.
+# source: ours
+TRIGGER_AHEAD = (30.0, 70.0)
 SAME_DIRECTION = np.pi / 4  # rad by which an arm may differ from the side it is on. source: ours
 
 
@@ -89,6 +92,7 @@ def place(
     crossing = site_module.next_junction(site)
     if crossing is None or crossing.way != stream.way:
         return None
+    site = near(site, crossing, rng)
     light = ego_light(site, crossing)
     if (light >= 0) != is_signalized:
         return None
@@ -105,6 +109,14 @@ def place(
         return scenario
     green = [row for row in (light, across.light) if row >= 0]
     return site_module.hold(site, scenario, crossing.junction, green)
+
+
+def near(site: Site, crossing: RouteJunction, rng: np.random.Generator) -> Site:
+    """The site, or one nearer to the junction where it is too far for what happens there."""
+    trigger_s = crossing.entry_s - float(rng.uniform(*TRIGGER_AHEAD))
+    if crossing.entry_s - site.trigger_s < TRIGGER_AHEAD[1]:
+        return site
+    return dataclasses.replace(site, index=site_module.place_at(site, trigger_s).index)
 
 
 def ego_light(site: Site, crossing: RouteJunction) -> int:

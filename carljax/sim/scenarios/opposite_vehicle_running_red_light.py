@@ -28,6 +28,7 @@ def place(site: Site, rng: np.random.Generator) -> Scenario | None:
     from_left_first = rng.random() < 0.5
     if crossing is None:
         return None
+    site = junction_flow.near(site, crossing, rng)
     light = junction_flow.ego_light(site, crossing)
     if light < 0:
         return None

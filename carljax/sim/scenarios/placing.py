@@ -63,19 +63,19 @@ def pavement(site: Site, place: Place, side: float) -> float:
     Returns:
       m to the middle of the pavement, where there is one; else to the verge beyond the road's edge.
     """
-    network = site.town.network
-    raw = site.town.lanes.members[place.lane]
-    roads = {network.lanes[row].road_id for row in raw}
+    lanes = site.town.network.lanes
+    xy, width, number = site.town.raw_points
+    offset = xy - place.xy
+    ahead = offset[:, 0] * np.cos(place.yaw) + offset[:, 1] * np.sin(place.yaw)
+    across = side * (offset[:, 1] * np.cos(place.yaw) - offset[:, 0] * np.sin(place.yaw))
+    near = (np.abs(ahead) < STRIP) & (across > -0.5) & (across < FARTHEST_PAVEMENT)
+    roads = {lanes[row].road_id for row in site.town.lanes.members[place.lane]}
     walks, edges = [], [0.0]
-    for lane in network.lanes:
-        offset = lane.xyz[:, :2] - place.xy
-        if np.abs(offset).max(axis=1).min() > FARTHEST_PAVEMENT:
-            continue
-        ahead = offset @ [np.cos(place.yaw), np.sin(place.yaw)]
-        across = side * (offset @ [-np.sin(place.yaw), np.cos(place.yaw)])
-        near = (np.abs(ahead) < STRIP) & (across > -0.5) & (across < FARTHEST_PAVEMENT)
+    for at in np.flatnonzero(near):
+        lane = lanes[number[at]]
         if lane.kind == "sidewalk":
-            walks.extend(across[near & (across > 1.0)])
+            walks.append(across[at])
         elif lane.road_id in roads:
-            edges.extend((across + 0.5 * lane.width)[near])
+            edges.append(across[at] + 0.5 * width[at])
+    walks = [to for to in walks if to > 1.0]
     return float(min(walks)) if walks else float(max(edges)) + VERGE
