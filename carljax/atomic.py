@@ -1,4 +1,4 @@
-"""Text files that are whole or not there: written beside their place, then renamed onto it."""
+"""Files that are whole or not there: written beside their place, then renamed onto it."""
 
 from __future__ import annotations
 
@@ -13,10 +13,20 @@ def write_text(path: Path, text: str) -> None:
       path: the file to write or replace.
       text: its whole content.
     """
+    write_bytes(path, text.encode("utf-8"))
+
+
+def write_bytes(path: Path, data: bytes) -> None:
+    """Writes a file in one visible step, making its folder where needed.
+
+    Args:
+      path: the file to write or replace.
+      data: its whole content.
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
     beside = path.with_name(f".{path.name}.{os.getpid()}")
     try:
-        beside.write_text(text, encoding="utf-8")
+        beside.write_bytes(data)
         os.replace(beside, path)
     finally:
         beside.unlink(missing_ok=True)
