@@ -28,6 +28,7 @@ SAFE_BRAKING = 4.0
 # m/s^2 for the sake of a better lane only. source: ours, so that nobody is cut off without need
 POLITE_BRAKING = 2.0
 MIN_GAP = 1.5  # m to either side. source: ours
+PULL_OUT = 12.0  # m behind a standing car from which one gets past it. source: ours, by the slope
 
 TRIES = 8  # cars that look beside in a step: each one about twice a second. source: ours
 LEAVES_FROM = 10.0  # m after a lane's beginning: no changes on the way out of a junction
@@ -210,6 +211,8 @@ def judge(
     must = _ends(cars.lanes, cars.lane_s, road_map)
     bound = -jnp.where(must, SAFE_BRAKING, POLITE_BRAKING)
     safe = (new.ahead > MIN_GAP) & (new.behind > MIN_GAP) & (goes > bound)
+    # Nobody stands so near ahead that there is no way around.
+    safe &= old.ahead + ROOM_TIME * old.leader_speed > PULL_OUT
     safe &= (behind_then > bound) | (new.behind >= FAR)
     return goes - stays + POLITENESS * others, safe
 

@@ -95,14 +95,15 @@ def leaders(agents: Agents, movers: Mover, road_map: RoadMap) -> tuple[jax.Array
     on_next = agents.lanes[:, 1:2] == left
     ahead = jnp.minimum(ahead, jnp.where(on_next, to_next[:, None] + left_s, FAR))
     ahead = ahead - half[:, None] - half[row]
-    # Those who leave behind everybody: (AT_ONCE, N + 1).
-    offset = movers.s - left_s[:, None]
-    gap = jnp.where((movers.lane == left[:, None]) & (offset > 0.0), offset, FAR)
-    gap = gap - half[row][:, None] - movers.half_length
+    # Those who leave behind everybody, others who leave the same lane too: (AT_ONCE, N + ...).
+    seen = with_leaving(movers, agents)
+    offset = seen.s - left_s[:, None]
+    gap = jnp.where((seen.lane == left[:, None]) & (offset > 0.0), offset, FAR)
+    gap = gap - half[row][:, None] - seen.half_length
     first = jnp.argmin(gap, axis=1)
     nearest = jnp.take_along_axis(gap, first[:, None], axis=1)[:, 0]
     is_mine = (jnp.arange(agents.lane_s.shape[0])[:, None] == row) & is_used  # (N, AT_ONCE)
     both = jnp.concatenate([ahead, jnp.where(is_mine, nearest, FAR)], axis=1)
-    speeds = jnp.concatenate([agents.speed[row], movers.speed[first]])
+    speeds = jnp.concatenate([agents.speed[row], seen.speed[first]])
     chosen = jnp.argmin(both, axis=1)
     return jnp.take_along_axis(both, chosen[:, None], axis=1)[:, 0], speeds[chosen]

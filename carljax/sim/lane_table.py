@@ -15,6 +15,7 @@ DEFAULT_SPEED_LIMIT = (
     50.0 / 3.6
 )  # m/s, for lanes of files that give none: built-up areas in most of Europe
 MIN_LENGTH = 1e-3  # m
+DRIVABLE_WIDTH = 2.5  # m, less is too narrow for a car. source: ours
 
 _STOP_KINDS = {"light": STOP_LIGHT, "stop": STOP_SIGN, "yield": STOP_YIELD}
 # Where a lane has several signals the first of these holds.
@@ -37,6 +38,8 @@ class LaneTable:
       members: for each lane the raw lanes it joins, indices into `RoadNetwork.lanes`.
       raw_lane: row of each raw lane in this table, -1 for lanes that aren't driven.
       raw_start: (raw,) where each raw lane begins on its row, m.
+      end: (K,) m, to where it is wide enough to drive on: less than its length only where it tapers
+        to an end.
       stop_signal: id of the signal that holds at the lane's stop line, "" for none.
     """
 
@@ -44,6 +47,7 @@ class LaneTable:
     raw_lane: np.ndarray
     raw_start: np.ndarray
     length: np.ndarray
+    end: np.ndarray
     num_points: np.ndarray
     start: np.ndarray
     speed_limit: np.ndarray
@@ -98,6 +102,7 @@ def build(network: RoadNetwork) -> LaneTable:
         raw_lane=raw_lane,
         raw_start=raw_start,
         length=length,
+        end=np.array([_end(chain, lanes, r) for chain, r in zip(chains, resampled, strict=True)]),
         num_points=num_points,
         start=np.concatenate([[0], np.cumsum(num_points)[:-1]]),
         speed_limit=np.array([lanes[c[0]].speed_limit or DEFAULT_SPEED_LIMIT for c in chains]),
@@ -180,6 +185,15 @@ def _resample(lanes: list[Lane]) -> tuple[np.ndarray, np.ndarray, np.ndarray, fl
     points = np.stack([np.interp(at, s, xyz[:, axis]) for axis in range(3)], axis=-1)
     wrapped = (np.interp(at, s, yaw) + np.pi) % (2 * np.pi) - np.pi
     return points, wrapped, np.interp(at, s, width), length
+
+
+def _end(chain: list[int], lanes: tuple[Lane, ...], resampled: tuple[np.ndarray, ...]) -> float:
+    """Where a lane that leads nowhere has become too narrow, m; else its length."""
+    _, _, width, length = resampled
+    wide = np.flatnonzero(width >= DRIVABLE_WIDTH)
+    if lanes[chain[-1]].successors or len(wide) == 0:
+        return float(length)
+    return float(length) * int(wide[-1]) / (len(width) - 1)
 
 
 def _curve_speed(yaw: np.ndarray, length: float) -> float:

@@ -33,6 +33,8 @@ class RoadMap(struct.PyTreeNode):
       lane_start: (K,) int32, first row of the lane in the point table.
       lane_num_points: (K,) int32, at least 2.
       lane_length: (K,) m; points are evenly spaced, about 1 m apart.
+      lane_end: (K,) m, to where it is wide enough to drive on; its length but where it tapers to an
+        end.
       lane_speed_limit: (K,) m/s.
       lane_curve_speed: (K,) m/s, speed at which the lane's sharpest bend is comfortable.
       lane_successors: (K, F) int32, F the most ways on from any lane; -1 pads.
@@ -73,6 +75,7 @@ class RoadMap(struct.PyTreeNode):
     lane_start: jax.Array
     lane_num_points: jax.Array
     lane_length: jax.Array
+    lane_end: jax.Array
     lane_speed_limit: jax.Array
     lane_curve_speed: jax.Array
     lane_successors: jax.Array

@@ -56,6 +56,7 @@ def _lane_arrays(towns: Sequence[Town]) -> dict[str, np.ndarray]:
             "lane_start": table.start + first.point,
             "lane_num_points": table.num_points,
             "lane_length": table.length,
+            "lane_end": table.end,
             "lane_speed_limit": table.speed_limit,
             "lane_curve_speed": table.curve_speed,
             "lane_successors": _widen(_shift(table.successors, first.lane), forks, -1),

@@ -12,6 +12,7 @@ from carljax.sim.lane_table import LaneTable
 SPACING = 8.0  # m between places on a lane
 MIN_WIDTH = 2.5  # m; tapering lanes begin where a car fits
 END_CLEARANCE = 6.0  # m kept to a lane's ends
+TAPER_CLEARANCE = 80.0  # m before a lane tapers to its end: room to change lanes. source: ours
 CELL = 20.0  # m, side of the grid cells of the respawn table
 CANDIDATES = 16  # respawn places a cell
 RING = (60.0, 140.0)  # m from the cell's centre
@@ -32,7 +33,9 @@ def places(table: LaneTable) -> Places:
     for row in range(len(table.length)):
         if table.junction[row] is not None:
             continue
-        at = np.arange(END_CLEARANCE, table.length[row] - END_CLEARANCE, SPACING)
+        tapers = table.end[row] < table.length[row]
+        end = table.end[row] - (TAPER_CLEARANCE if tapers else END_CLEARANCE)
+        at = np.arange(END_CLEARANCE, end, SPACING)
         points = table.points(row)
         known = np.linspace(0.0, table.length[row], int(table.num_points[row]))
         width = np.interp(at, known, table.point_width[points])

@@ -108,16 +108,18 @@ def accelerations(
 ) -> jax.Array:
     """(N,) m/s^2: the hardest braking that any leader, line or junction asks for."""
     desired = desired_speed(agents, road_map)
+    drivers = vehicles.driver(agents.model, params)
     gap, leader_speed = leaders(agents, movers, road_map)
     change_gap, change_speed = lane_shift.leaders(agents, movers, road_map)
     ego_gap = corridor_gap(agents, ego, ego_length)
     line = jnp.where(must_stop(agents, stop), stop.distance - STOP_MARGIN, FAR)
     gate = jnp.where(gated(agents, movers, road_map), movers.entry[:-1] - STOP_MARGIN, FAR)
-    dead_end = jnp.where(agents.lanes[:, 1] < 0, movers.entry[:-1] - STOP_MARGIN, FAR)
+    lane_end = road_map.lane_end[planned_lane(agents, 0)] - agents.lane_s - 0.5 * agents.length
+    dead_end = jnp.where(agents.lanes[:, 1] < 0, lane_end - STOP_MARGIN, FAR)
     still = jnp.minimum(jnp.minimum(line, gate), dead_end)
 
     def respond(gap: jax.Array, leader_speed: jax.Array) -> jax.Array:
-        return idm.acceleration(agents.speed, gap, leader_speed, desired, params)
+        return idm.acceleration(agents.speed, gap, leader_speed, desired, drivers)
 
     accel = jnp.minimum(respond(gap, leader_speed), respond(change_gap, change_speed))
     accel = jnp.minimum(accel, respond(ego_gap, ego.speed))

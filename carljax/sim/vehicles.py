@@ -54,9 +54,9 @@ CLASSES = (
     # source: Volkswagen T2 4.4 x 1.8, Mercedes Sprinter 5.9 x 2.0, Ford ambulance 6.4 x 2.4
     VehicleClass((4.4, 6.4), (1.8, 2.3), 1.0, 1.0, 36.0, share=0.09),
     # source: Carlacola 5.2 x 2.6, European HGV 7.9, firetruck 8.5; 80 km/h by law in much of Europe
-    VehicleClass((5.2, 8.5), (2.4, 2.6), 0.5, 0.9, 22.2, share=0.06, bend_radius=12.0),
+    VehicleClass((5.2, 8.5), (2.4, 2.6), 0.5, 0.9, 22.2, share=0.06, bend_radius=20.0),
     # source: Mitsubishi Fusorosa 10.3
-    VehicleClass((9.9, 10.3), (2.5, 2.6), 0.46, 0.9, 22.2, share=0.02, bend_radius=15.0),
+    VehicleClass((9.9, 10.3), (2.5, 2.6), 0.46, 0.9, 22.2, share=0.02, bend_radius=25.0),
     # source: Vespa 1.8 x 0.87 to Harley-Davidson 2.4 x 0.77; SUMO's is 2.3 times as brisk as a car
     VehicleClass((1.8, 2.4), (0.76, 0.87), 1.5, 1.2, ANY_SPEED, share=0.04),
     # source: Diamondback Century 1.7 x 0.58, Gazelle Omafiets 1.8 x 0.66; SUMO rides at 20 km/h
