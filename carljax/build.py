@@ -10,15 +10,17 @@ from typing import Any
 import jax
 from jax.sharding import Mesh
 
-from carljax import machine, memory
+from carljax import machine, memory, route_bank
 from carljax.config import ConfigError, TrainConfig
 from carljax.memory import MemoryEstimate
 from carljax.ppo import trainer
 from carljax.ppo.networks import ActorCritic
 from carljax.ppo.rollout import rollout
 from carljax.ppo.types import TrainState
-from carljax.sim import episodes, town, towns
+from carljax.route_bank import BankError
+from carljax.sim import episodes, journey, town, towns
 from carljax.sim.env import DrivingEnv, make_env
+from carljax.sim.journey import Journey
 from carljax.sim.town import Town
 
 
@@ -61,14 +63,59 @@ def setup(config: TrainConfig) -> Setup:
         raise ConfigError(f"run.num_devices: {error}") from error
     config.validate(mesh.size)
     loaded = load_towns(config.run.maps)
-    training = environment(config, loaded, config.run.num_routes, config.run.seed)
+    if config.run.routes:
+        training = environment_on(config, loaded, read_banks(config, loaded), config.run.seed)
+    else:
+        training = environment(config, loaded, config.run.num_routes, config.run.seed)
     training = trainer.replicate(training, mesh)
     return Setup(config, loaded, training, ActorCritic(config.network), mesh)
 
 
 def load_towns(maps: Sequence[Path]) -> list[Town]:
     """Reads the user's maps, or the bundled towns to train in where there are none."""
-    return [town.load(path) for path in maps or [towns.path(name) for name in towns.TRAINING]]
+    return [town.load(path) for path in _map_files(maps)]
+
+
+def _map_files(maps: Sequence[Path]) -> Sequence[Path]:
+    return maps or [towns.path(name) for name in towns.TRAINING]
+
+
+def read_banks(config: TrainConfig, loaded: Sequence[Town]) -> list[Journey]:
+    """Reads the configuration's banks of routes.
+
+    Args:
+      config: with `run.routes`.
+      loaded: the towns of its maps.
+
+    Returns:
+      The journeys of all banks, in the tables that the towns share.
+
+    Raises:
+      ConfigError: a bank can't be read, is of another map, or a town has none.
+    """
+    files = list(_map_files(config.run.maps))
+    digests = [route_bank.map_sha256(file) for file in files]
+    firsts = town.offsets(loaded)
+    journeys: list[Journey] = []
+    missing = set(range(len(files)))
+    try:
+        for path in config.run.routes:
+            made = route_bank.read_origin(path)
+            if made.map_sha256 not in digests:
+                raise ConfigError(
+                    f"run.routes: {path}: was made for the map {made.map_name} with SHA-256 "
+                    f"{made.map_sha256[:12]}, which is none of this run's maps"
+                )
+            at = digests.index(made.map_sha256)
+            read = route_bank.load(path, loaded[at], files[at])
+            journeys += [journey.shift(one, firsts[at]) for one in read]
+            missing.discard(at)
+    except BankError as error:
+        raise ConfigError(f"run.routes: {error}") from error
+    if missing:
+        lacking = files[min(missing)]
+        raise ConfigError(f"run.routes: there is no bank for {lacking}, one of this run's maps")
+    return journeys
 
 
 def environment(
@@ -93,6 +140,24 @@ def environment(
         config.env.route_length,
         config.env.scenario_spacing,
     )
+    return make_env(bank, config.env, config.reward)
+
+
+def environment_on(
+    config: TrainConfig, loaded: Sequence[Town], journeys: Sequence[Journey], seed: int
+) -> DrivingEnv:
+    """Makes the environment that drives on given routes.
+
+    Args:
+      config: the run's configuration.
+      loaded: the towns.
+      journeys: the routes with their scenarios, in the tables that the towns share.
+      seed: of first places of traffic.
+
+    Returns:
+      The environment.
+    """
+    bank = episodes.populate(loaded, journeys, config.env.population, seed)
     return make_env(bank, config.env, config.reward)
 
 

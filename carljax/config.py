@@ -43,9 +43,16 @@ class RunConfig:
         tyro.conf.UseAppendAction,
         tyro.conf.arg(name="map", prefix_name=False, metavar="FILE.xodr"),
     ] = ()
-    """OpenDRIVE file to train and be scored in; repeatable. None: the bundled towns for training."""
+    """OpenDRIVE file to train and be scored in; repeatable. None: the bundled ones for training."""
     num_routes: int = 512
-    """Training routes drawn ahead from the seed, over all towns."""
+    """Training routes drawn ahead from the seed, over all towns; with banks, theirs count."""
+    routes: Annotated[
+        tuple[Path, ...],
+        tyro.conf.UseAppendAction,
+        tyro.conf.arg(metavar="BANK.npz"),
+    ] = ()
+    """Bank of routes to train on, from `python -m carljax.routes make`; repeatable, one at least
+    for each town. None: routes are drawn."""
     num_devices: int | None = None
     """Accelerators or CPU devices to share the environments among; all by default."""
     log_every: int = 1

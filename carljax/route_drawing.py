@@ -19,7 +19,7 @@ from carljax.sim.town import Town
 from carljax.sim.types import KIND_NONE
 
 SUFFIXES = (".png", ".jpg", ".pdf", ".svg")
-ROUTE, CAR, OTHER = "#2f6fdf", "#d95b4b", "#8a3fc0"
+ROUTE = "#2f6fdf"
 # One for each kind, in order of `registry.KINDS`, repeating.
 KIND_COLOURS = ("#e07b00", "#c1121f", "#8a3fc0", "#0a7d5a", "#b5179e", "#007f9e", "#7a5c00")
 ABOVE = 960.0  # zorder, over everything of the map

@@ -98,10 +98,9 @@ def split_checkpoint(path: Path) -> tuple[Path, int | None]:
 
 
 def map_digests(train_config: TrainConfig) -> dict[str, str]:
-    """Hashes the user's map files: {path: SHA-256}."""
-    return {
-        str(file): hashlib.sha256(file.read_bytes()).hexdigest() for file in train_config.run.maps
-    }
+    """Hashes the user's maps and banks of routes: {path: SHA-256}."""
+    files = (*train_config.run.maps, *train_config.run.routes)
+    return {str(file): hashlib.sha256(file.read_bytes()).hexdigest() for file in files}
 
 
 def _note_start(path: Path, train_config: TrainConfig) -> None:
