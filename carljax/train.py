@@ -103,7 +103,8 @@ def run(command: Command, console: Console) -> int:
     wanted = command.config
     path = wanted.run.dir or run_dir.default_path()
     maps = tuple(file.resolve() for file in wanted.run.maps)
-    wanted = _with_run(wanted, dir=path, maps=maps)
+    banks = tuple(file.resolve() for file in wanted.run.routes)
+    wanted = _with_run(wanted, dir=path, maps=maps, routes=banks)
     if wanted.run.compile_cache is not None:
         jax.config.update("jax_compilation_cache_dir", str(wanted.run.compile_cache.resolve()))
     if command.resume is None:
@@ -167,7 +168,7 @@ def _check_same_experiment(saved: TrainConfig, asked: TrainConfig) -> None:
     old, new = config.to_json(saved), config.to_json(asked)
     for part, fields in old.items():
         for name, value in fields.items():
-            fixed = name in ("seed", "maps", "num_routes") if part == "run" else True
+            fixed = name in ("seed", "maps", "num_routes", "routes") if part == "run" else True
             if fixed and name != "total_samples" and new[part][name] != value:
                 raise ConfigError(
                     f"{part}.{name}: is {value} in the run to be continued, can't become"
