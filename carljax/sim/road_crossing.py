@@ -16,7 +16,8 @@ GAP_MARGIN = 1.5  # s between leaving a vehicle's way and its arrival. source: o
 STEP_MARGIN = 0.5  # s, likewise for the next lane once on the road. source: ours
 BESIDE = 0.75  # m kept to a vehicle's sides: half a body and half a metre
 IN_FRONT = 1.25  # m kept to a vehicle that stands in its way, likewise and a step
-ROLLING = 0.3  # m/s, slower vehicles are taken to stand
+ROLLING = 0.5  # m/s, slower vehicles are taken to stand
+PICK_UP = 1.5  # m/s by which a rolling vehicle may yet be faster. source: ours, a second of green
 # What a driver needs to stop: time to see and m/s^2. source: textbook values, half of a full stop
 REACTION_S, DRIVER_BRAKING = 1.0, 4.0
 # A vehicle may come to any place in a cone before it: half its width at the front, and its slope.
@@ -121,7 +122,7 @@ def must_wait(
       ego_size: (2,) its length and width, m.
     """
     seen = meetings(bodies, edge, others, ego, ego_size)
-    arrive = seen.distance / jnp.maximum(seen.speed, ROLLING)
+    arrive = seen.distance / (seen.speed + PICK_UP)
     leave = seen.leave / jnp.maximum(walkers.pace, 0.1)[:, None]
     needs = seen.speed * REACTION_S + seen.speed**2 / (2 * DRIVER_BRAKING)
     reckless = walkers.is_reckless[:, None]

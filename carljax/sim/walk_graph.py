@@ -29,7 +29,6 @@ SPACING = 3.0  # m between nodes: chords stay within 0.3 m of a corner of 4 m ra
 SAME = 0.6  # m, nodes closer than this are one
 JOIN = 3.0  # m, gaps between the ends of pavements that are stepped over
 RING = (66.0, 115.0)  # m from a cell's centre, where people appear: just out of CaRL's image
-KERB_MARGIN = 0.6  # m from the pavement's edge to where people wait
 
 
 @dataclasses.dataclass(frozen=True)
@@ -79,8 +78,8 @@ def build(network: RoadNetwork, table: LaneTable) -> WalkGraph:
     draft, joints = _merged(draft, joints)
     _join_ends(draft, road)
     num_pavement = len(draft.xyz)
-    for way, (first, second) in zip(across, joints, strict=True):
-        _across(draft, way, first, second, pavements)
+    for way, ends in zip(across, joints, strict=True):
+        _across(draft, way, ends)
     xyz = np.array(draft.xyz)
     xyz[:, 2] = road.height(xyz)
     return _table(xyz, draft.edges, num_pavement)
@@ -169,24 +168,18 @@ def _join_ends(draft: _Draft, road: Road) -> None:
             break
 
 
-def _across(draft: _Draft, way: Way, first: int, second: int, pavements: Pavements) -> None:
+def _across(draft: _Draft, way: Way, ends: tuple[int, int]) -> None:
     """Adds the two kerbs of a way and the edges over them."""
-    ends = np.array([draft.xyz[first], draft.xyz[second]])
-    length = float(np.hypot(*(ends[1] - ends[0])[:2]))
-    if length < 2.0:  # both ends have become one
-        return
-    kerbs = []
-    for end in range(2):
-        strip = pavements.strips[way.strips[end]]
-        half = float(np.interp(way.s[end], strip.s, strip.width)) / 2
-        onward = max(half - KERB_MARGIN, 0.1) / length
-        kerbs.append(draft.add(ends[end] + onward * (ends[1 - end] - ends[end])))
+    first, second = (
+        draft.add(np.append(kerb, draft.xyz[end][2]))
+        for kerb, end in zip(way.kerbs, ends, strict=True)
+    )
     kind = WALK_CROSSING if way.is_crosswalk else WALK_JAYWALK
     to_kerb = WALK_TO_CROSSING if way.is_crosswalk else WALK_TO_JAYWALK
     draft.edges += [
-        (first, kerbs[0], to_kerb, WALK_PAVEMENT),
-        (kerbs[0], kerbs[1], kind, kind),
-        (second, kerbs[1], to_kerb, WALK_PAVEMENT),
+        (ends[0], first, to_kerb, WALK_PAVEMENT),
+        (first, second, kind, kind),
+        (ends[1], second, to_kerb, WALK_PAVEMENT),
     ]
 
 

@@ -13,8 +13,10 @@ from carljax.sim.road_network import Lane, RoadNetwork
 
 SIDEWALK = "sidewalk"
 STEP = 0.5  # m between the points at which pavements are looked up
+KERB_BEYOND = 0.4  # m from a crosswalk's end to where people wait. source: ours
+KERB_MARGIN = 0.6  # m likewise from a pavement's edge to the road. source: ours
 MIN_WIDTH = 0.8  # m, narrower pavements end here. source: ours, room for one person
-ATTACH = 6.0  # m from a crosswalk's end to the pavement it leads to. source: ours
+ATTACH = 5.0  # m from a crosswalk's end to the middle of its pavement. source: ours
 JAYWALK_SPACING = 18.0  # m between places to cross without a crosswalk. source: ours
 JAYWALK_CLEARANCE = 15.0  # m kept to crosswalks and junctions: who is so near uses them
 MIN_ROAD, MAX_ROAD = 3.0, 15.0  # m of carriageway: one lane to four
@@ -50,11 +52,13 @@ class Way:
     Attributes:
       strips: the two pavements.
       s: where along each, m.
+      kerbs: (2, 2) m, where people wait at either end.
       is_crosswalk: whether it is a crosswalk.
     """
 
     strips: tuple[int, int]
     s: tuple[float, float]
+    kerbs: np.ndarray
     is_crosswalk: bool
 
 
@@ -76,7 +80,7 @@ class Road:
         cos, sin = np.cos(self.yaw[near]), np.sin(self.yaw[near])
         along = offset[..., 0] * cos + offset[..., 1] * sin
         lateral = offset[..., 1] * cos - offset[..., 0] * sin
-        return np.asarray(((abs(along) < 0.6) & (abs(lateral) < self.width[near] / 2)).any(axis=1))
+        return np.asarray(((abs(along) < 0.6) & (abs(lateral) <= self.width[near] / 2)).any(axis=1))
 
     def height(self, xyz: np.ndarray) -> np.ndarray:
         """(n,) m, height of the nearest driving lane on the same level."""
@@ -94,6 +98,7 @@ class Pavements:
             return
         self.xyz = np.concatenate([strip.xyz for strip in self.strips])
         self.s = np.concatenate([strip.s for strip in self.strips])
+        self.width = np.concatenate([strip.width for strip in self.strips])
         sizes = [len(strip.s) for strip in self.strips]
         self.owner = np.repeat(np.arange(len(sizes)), sizes)
         self.tree = cKDTree(self.xyz[:, :2])
@@ -133,21 +138,23 @@ def _crosswalk(polygon: np.ndarray, pavements: Pavements) -> Way | None:
     """
     centre = polygon.mean(axis=0)
     axis = np.linalg.eigh(np.cov((polygon - centre).T))[1][:, -1]
-    reach = (polygon - centre) @ axis
-    found = []
-    for direction, length in ((axis, reach.max()), (-axis, -reach.min())):
-        end = centre + length * direction
-        near = np.array(pavements.tree.query_ball_point(end, ATTACH), int)
-        offset = pavements.xyz[near, :2] - end
-        forward = offset @ direction
-        lateral = abs(offset[:, 0] * direction[1] - offset[:, 1] * direction[0])
-        good = forward > -1.0
-        if not good.any():
-            return None
-        # Straight on rather than near: pavements bend away at corners.
-        found.append(near[good][np.argmin((2.0 * lateral + abs(forward))[good])])
-    first, second = (int(i) for i in found)
-    return _way(pavements, first, second, True)
+    along = (polygon - centre) @ axis
+    across = (polygon - centre) @ np.array([-axis[1], axis[0]])
+    ends = [
+        a0 + (a1 - a0) * c0 / (c0 - c1)
+        for a0, a1, c0, c1 in zip(
+            along, np.roll(along, -1), across, np.roll(across, -1), strict=True
+        )
+        if c0 * c1 < 0.0  # this side is crossed by the axis
+    ]
+    if len(ends) < 2:
+        return None
+    reach = np.array([min(ends) - KERB_BEYOND, max(ends) + KERB_BEYOND])
+    kerbs = centre + reach[:, None] * axis
+    away, rows = pavements.tree.query(kerbs)
+    if away.max() > ATTACH or pavements.owner[rows[0]] == pavements.owner[rows[1]]:
+        return None
+    return _way(pavements, int(rows[0]), int(rows[1]), kerbs, True)
 
 
 def _jaywalks(pavements: Pavements, road: Road, crosswalks: np.ndarray) -> Iterator[Way]:
@@ -169,7 +176,8 @@ def _jaywalks(pavements: Pavements, road: Road, crosswalks: np.ndarray) -> Itera
             taken.append(middle)
             here = np.flatnonzero(pavements.owner == number)
             first = here[np.argmin(abs(pavements.s[here] - s))]
-            yield _way(pavements, int(first), other, False)
+            kerbs = _kerbs(pavements, np.array([first, other]))
+            yield _way(pavements, int(first), other, kerbs, False)
 
 
 def _opposite(strip: Strip, number: int, s: float, pavements: Pavements, road: Road) -> int | None:
@@ -180,10 +188,10 @@ def _opposite(strip: Strip, number: int, s: float, pavements: Pavements, road: R
     normal = np.array([-along[1], along[0]]) / max(float(np.hypot(*along)), 1e-9)
     to_road = road.xyz[road.tree.query(here[:2])[1], :2] - here[:2]
     normal = normal if normal @ to_road > 0 else -normal
-    reach = np.arange(MIN_ROAD, MAX_REACH, STEP)
+    reach = np.arange(0.0, MAX_REACH, STEP)
     on_line = here[:2] + reach[:, None] * normal
     away, row = pavements.tree.query(on_line)
-    hit = (away < STEP) & (pavements.owner[row] != number)
+    hit = (away < STEP) & (pavements.owner[row] != number) & (reach > MIN_ROAD)
     if not hit.any():
         return None
     first = int(np.argmax(hit))
@@ -195,9 +203,20 @@ def _opposite(strip: Strip, number: int, s: float, pavements: Pavements, road: R
     return other if level and open_road else None
 
 
-def _way(pavements: Pavements, first: int, second: int, is_crosswalk: bool) -> Way:
+def _kerbs(pavements: Pavements, rows: np.ndarray) -> np.ndarray:
+    """(2, 2) m, the kerbs between two pavement points on either side of a road."""
+    middle = pavements.xyz[rows, :2]
+    onward = (middle[1] - middle[0]) / np.hypot(*(middle[1] - middle[0]))
+    inward = np.maximum(pavements.width[rows] / 2 - KERB_MARGIN, 0.1)[:, None]
+    return middle + inward * np.stack([onward, -onward])
+
+
+def _way(
+    pavements: Pavements, first: int, second: int, kerbs: np.ndarray, is_crosswalk: bool
+) -> Way:
     return Way(
         strips=(int(pavements.owner[first]), int(pavements.owner[second])),
         s=(float(pavements.s[first]), float(pavements.s[second])),
+        kerbs=kerbs,
         is_crosswalk=is_crosswalk,
     )
