@@ -1,6 +1,7 @@
 """Traffic lights: one cycle by hand, and who is green together."""
 
 import dataclasses
+import types
 
 import jax
 import jax.numpy as jnp
@@ -124,3 +125,76 @@ def test_one_group_at_a_time_goes_in_bundled_towns(name, bundled):
         seen = state[: round(10 * period.pop()), rows]
         assert ((seen != LIGHT_RED).sum(axis=1) <= 1).all()
         np.testing.assert_allclose((seen == LIGHT_GREEN).sum(axis=0), 100, atol=1)  # 10 s each
+
+
+# Junctions that a scenario holds. Lights 0 and 1 share junction 0 and a cycle of 30 s, green from
+# 0 and from 15 s on; light 2 is that of another junction, green from 0 s on.
+TABLE = types.SimpleNamespace(
+    light_start=f32(0.0, 15.0, 0.0),
+    light_cycle=f32(30.0, 30.0, 30.0),
+    light_junction=jnp.int32([0, 0, 1]),
+)
+ALL_LIGHTS = jnp.arange(3)
+
+
+def held(green, begin, end):
+    """At a time, what the three lights show, and their seconds of yellow left."""
+    clock = lights.clock(f32(0.0)[0], 2).replace(
+        held_junction=jnp.int32([-1, 0]),
+        held_green=jnp.int32([[-1, -1], [green, -1]]),
+        held_from=f32(-np.inf, begin),
+        held_until=f32(-np.inf, end),
+    )
+
+    def at(time):
+        now = clock.replace(time=jnp.float32(time))
+        shown = lights.colour(ALL_LIGHTS, now, TABLE)
+        return shown.tolist(), lights.yellow_left_of(ALL_LIGHTS, now, TABLE)
+
+    return at
+
+
+def test_a_hold_turns_the_others_red_and_then_its_own_green():
+    # From 5 s on light 1 is held green. Light 0 was green: 3 s of yellow, then red. Light 1 was
+    # red: so it stays for 3 + 2 s, until 10 s, and green after that, beyond its programme (15 to
+    # 25 s) too.
+    at = held(green=1, begin=5.0, end=np.inf)
+    times = [4.9, 5.1, 7.9, 8.1, 9.9, 10.1, 20.0, 26.0, 31.0, 100.0]
+    first = [G, Y, Y, R, R, R, R, R, R, R]
+    second = [R, R, R, R, R, G, G, G, G, G]
+    assert [at(t)[0][0] for t in times] == first
+    assert [at(t)[0][1] for t in times] == second
+    # The other junction goes on: green 0 to 10, yellow to 13, red to 30 s.
+    assert [at(t)[0][2] for t in times] == [G, G, G, G, G, Y, R, R, G, Y]
+
+
+def test_a_light_that_is_green_when_it_is_held_stays_so():
+    at = held(green=0, begin=5.0, end=np.inf)
+    assert [at(t)[0][0] for t in (5.1, 8.1, 10.1, 14.0, 99.0)] == [G] * 5
+    assert [at(t)[0][1] for t in (5.1, 8.1, 10.1, 16.0, 99.0)] == [R] * 5
+
+
+def test_a_light_that_is_yellow_when_it_is_held_turns_red_first():
+    # Light 0 is yellow from 10 to 13 s; held green from 11 s: yellow to 14 s, red to 16 s.
+    at = held(green=0, begin=11.0, end=np.inf)
+    assert [at(t)[0][0] for t in (10.9, 11.1, 13.9, 14.1, 15.9, 16.1)] == [Y, Y, Y, R, R, G]
+    at = held(green=1, begin=11.0, end=np.inf)
+    assert [at(t)[0][0] for t in (10.9, 11.1, 13.9, 14.1, 15.9, 16.1)] == [Y, Y, Y, R, R, R]
+
+
+def test_a_hold_ends_by_yellow_and_a_moment_of_red():
+    # Held green from 5 to 40 s: yellow to 43 s, red to 45 s, then the programme: at 45 s light 1
+    # turns green (15 + 30), light 0 at 60 s.
+    at = held(green=1, begin=5.0, end=40.0)
+    times = [39.9, 40.1, 42.9, 43.1, 44.9, 45.1, 54.9, 55.1, 60.1]
+    assert [at(t)[0][1] for t in times] == [G, Y, Y, R, R, G, G, Y, R]
+    assert [at(t)[0][0] for t in times] == [R, R, R, R, R, R, R, R, G]
+
+
+def test_yellow_left_of_a_held_light():
+    at = held(green=1, begin=5.0, end=40.0)
+    left = [[float(at(t)[1][light]) for t in (5.5, 7.0, 8.5)] for light in (0, 2)]
+    np.testing.assert_allclose(left[0], [2.5, 1.0, 0.0], atol=1e-5)
+    np.testing.assert_allclose(left[1], [3.0, 3.0, 3.0], atol=1e-5)  # not held, green to 10 s
+    left = [float(at(t)[1][1]) for t in (40.5, 42.0, 43.5)]
+    np.testing.assert_allclose(left, [2.5, 1.0, 0.0], atol=1e-5)
