@@ -90,7 +90,7 @@ def test_a_trigger_is_placed_at_the_nearest_point_of_the_route(stage):
         (trigger(60, 3.0, yaw=np.pi), "the route does not go its way there"),
         (trigger(60, 3.0, yaw=np.radians(50)), "the route does not go its way there"),
         (trigger(60, type="Unheard"), "there is no such kind of scenario here"),
-        (trigger(60, type="Never"), "does not suit the route there"),
+        (trigger(60, type="Never"), "does not suit the route there, 140 m before its end"),
         (trigger(60, type="Scenario99"), "there is no such kind of scenario here"),
     ],
 )

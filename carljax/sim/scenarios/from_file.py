@@ -146,7 +146,8 @@ def _place(
 def _refusal(stage: Stage, kinds: Sequence[str], index: int) -> str:
     """Why no kind may suit a place, as far as can be told from outside."""
     if not generator.AT_JUNCTION.issuperset(kinds):
-        return "does not suit the route there"
+        left = float(stage.route.length - stage.route.s[index])
+        return f"does not suit the route there, {left:.0f} m before its end"
     crossing = site_module.next_junction(Site(stage.town, stage.first, stage.route, index))
     if crossing is None:
         return "there is no junction ahead that the route passes"
