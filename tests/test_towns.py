@@ -18,7 +18,7 @@ from scipy.sparse.csgraph import connected_components
 from carljax.sim import opendrive, towns
 from carljax.sim.road_network import Lane, RoadNetwork
 
-TOWNS = ("grid", "highway", "village")
+TOWNS = ("grid", "highway", "suburb", "village")
 MAKE_TOWNS = pathlib.Path(__file__).resolve().parent.parent / "tools" / "make_towns.py"
 KMH = 1 / 3.6
 
@@ -62,7 +62,7 @@ def test_each_town_is_either_for_training_or_kept_for_scoring() -> None:
 
 
 def test_an_unknown_town_is_refused_with_the_names_that_exist() -> None:
-    with pytest.raises(ValueError, match="'gird'; there are: grid, highway, village"):
+    with pytest.raises(ValueError, match="'gird'; there are: grid, highway, suburb, village"):
         towns.path("gird")
 
 
@@ -96,8 +96,16 @@ def test_the_towns_are_drawn_again_byte_for_byte(tmp_path: pathlib.Path) -> None
 # lanes. Inside: 2 crossings with 14, 2 ramp zones with 8 (each way 2 on, 1 aside, 1 ramp), 4 ramp
 # ends with 4: 28 + 16 + 16 = 60. Lights: 4 + 4 at the crossings, 3 + 2 at the inner ramp ends; stop
 # lines the same and 1 at the stop sign; 12 * 2 + 4 speed signs; crosswalks 2 + 2 + 1 + 1.
+#
+# suburb. 3 roads of the avenue with 4 lanes, 4 with bays in 3 sections of 2, 12 plain ones with 2,
+# the ring's 4: 12 + 24 + 24 + 4 = 64. Inside: 2 crossings of the avenue's ends with 12, 2 junctions
+# on it with 8 (4 along, 4 turns), 4 at the ring with 3, 4 with three arms of 6, 2 with 12: 24 + 16
+# + 12 + 24 + 24 = 100. 14 arms with lights; stop signs 1 + 2 + 4; yield signs 4 at the ring and 3;
+# 19 * 2 + 4 speed signs; a crosswalk at every light and stop sign; a stop line at each of these
+# and at the 3 yield signs away from the ring.
 COUNTS = {
     "grid": (68, 142, 16, 54, 0, 0, 54, 40, 54),
+    "suburb": (64, 100, 14, 14, 7, 7, 42, 21, 24),
     "village": (30, 60, 9, 0, 7, 7, 26, 7, 10),
     "highway": (42, 60, 8, 13, 1, 0, 28, 6, 14),
 }
@@ -123,8 +131,10 @@ def test_counts_are_those_of_the_plan(name: str) -> None:
 
 
 # CARLA's reader, sampled every metre, sums up to 8.51, 10.01 and 5.49 km; it misses half a metre at
-# the ends of each of 210, 102 and 90 lanes.
-@pytest.mark.parametrize(("name", "km"), [("grid", 8.61), ("highway", 10.06), ("village", 5.53)])
+# the ends of each of 210, 102 and 90 lanes. The suburb's is that of the plan's reference lines.
+@pytest.mark.parametrize(
+    ("name", "km"), [("grid", 8.61), ("highway", 10.06), ("suburb", 8.98), ("village", 5.53)]
+)
 def test_lane_kilometres(name: str, km: float) -> None:
     assert sum(length(lane) for lane in driving(name)) / 1000 == pytest.approx(km, abs=0.03)
 
@@ -162,7 +172,7 @@ def test_no_bend_is_tighter_than_eight_metres(name: str) -> None:
 # Lanes are 3.5 m wide but for the roundabout's ring (4.5 m) and the street that narrows (2.9 m).
 @pytest.mark.parametrize(
     ("name", "narrowest", "widest"),
-    [("grid", 3.5, 3.5), ("highway", 3.5, 3.5), ("village", 2.9, 4.5)],
+    [("grid", 3.5, 3.5), ("highway", 3.5, 3.5), ("suburb", 3.5, 4.5), ("village", 2.9, 4.5)],
 )
 def test_widths(name: str, narrowest: float, widest: float) -> None:
     widths = np.concatenate([lane.width for lane in driving(name)])
@@ -174,7 +184,7 @@ def test_widths(name: str, narrowest: float, widest: float) -> None:
 @pytest.mark.parametrize("name", TOWNS)
 def test_every_lane_has_a_speed_limit_and_its_signs_say_the_same(name: str) -> None:
     town = network(name)
-    limits = {30, 50} if name != "highway" else {40, 50, 60, 80, 100}
+    limits = {"highway": {40, 50, 60, 80, 100}, "suburb": {30, 50, 60}}.get(name, {30, 50})
     assert {round((lane.speed_limit or 0) / KMH, 6) for lane in driving(name)} == limits
     for signal in town.signals:
         if signal.kind == "speed":
@@ -183,7 +193,7 @@ def test_every_lane_has_a_speed_limit_and_its_signs_say_the_same(name: str) -> N
                 assert town.lanes[place.lane].speed_limit == pytest.approx(signal.value)
 
 
-@pytest.mark.parametrize("name", ["grid", "highway"])
+@pytest.mark.parametrize("name", ["grid", "highway", "suburb"])
 def test_a_light_governs_every_lane_of_its_junction_exactly_once(name: str) -> None:
     town = network(name)
     lights = {signal.id: signal for signal in town.signals if signal.kind == "light"}
@@ -256,6 +266,29 @@ def test_village_gives_way_at_the_ring_and_stops_at_the_eastern_crossing() -> No
     east = [s for s in town.signals if s.kind == "stop" and math.dist(s.xyz[:2], (150, 20)) < 20]
     # Each of the four stops governs the left turn, the way on and the right turn.
     assert len(east) == 4 and all(len(signal.governed) == 3 for signal in east)
+
+
+def test_suburb_serves_the_avenue_first_and_then_each_side_street() -> None:
+    town = network("suburb")
+    sizes = [
+        [len(town.controllers[c].signals) for c in junction.controllers]
+        for junction in town.junctions.values()
+        if junction.controllers
+    ]
+    # Two crossings with a street on either side, two junctions with a street on one.
+    assert sorted(sizes) == [[2, 1], [2, 1], [2, 1, 1], [2, 1, 1]]
+
+
+def test_suburb_has_bays_beside_four_streets_and_none_near_junctions() -> None:
+    bays = [lane for lane in network("suburb").lanes if lane.kind == "parking"]
+    assert len(bays) == 8
+    for lane in bays:
+        assert lane.width.max() == pytest.approx(2.2, abs=1e-6)
+        assert lane.width[[0, -1]] == pytest.approx([0, 0], abs=1e-4)
+
+
+def test_suburb_is_kept_for_scoring() -> None:
+    assert towns.HELD_OUT == ("suburb",) and "suburb" not in towns.TRAINING
 
 
 def test_highway_lanes_lie_where_the_plan_puts_them() -> None:

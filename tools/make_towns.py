@@ -8,9 +8,14 @@ from __future__ import annotations
 import pathlib
 import sys
 
-from towns import grid, highway, village, writer
+from towns import grid, highway, suburb, village, writer
 
-BUILDERS = {"grid": grid.build, "village": village.build, "highway": highway.build}
+BUILDERS = {
+    "grid": grid.build,
+    "village": village.build,
+    "highway": highway.build,
+    "suburb": suburb.build,
+}
 TARGET = pathlib.Path(__file__).resolve().parent.parent / "carljax" / "sim" / "towns"
 
 

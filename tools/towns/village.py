@@ -6,8 +6,8 @@ import dataclasses
 import math
 
 from towns import geometry, signs
-from towns.crossing import add_junction, connect_all
 from towns.geometry import Pose
+from towns.nodes import RING_ROOM, Node, add_crossing, add_roundabout, pose
 from towns.plan import (
     CENTRE_BROKEN,
     LANE_WIDTH,
@@ -15,7 +15,6 @@ from towns.plan import (
     Arm,
     Cubic,
     LaneSpec,
-    Road,
     Section,
     Town,
     ease,
@@ -23,36 +22,7 @@ from towns.plan import (
 )
 
 STREET_SPEED, ROAD_SPEED = 30.0, 50.0
-# From the middle of a junction to its arms, m.
-ROOM = 13.0
-# Roundabout: lane centre radius, lane width, distance of the arms, half the angle of an arm.
-RING_RADIUS, RING_WIDTH, RING_ROOM, RING_HALF = 15.0, 4.5, 27.0, math.radians(30.0)
 NARROW, PARKING = 2.9, 2.2
-
-
-@dataclasses.dataclass(frozen=True)
-class Node:
-    """A junction: where it lies, how high, the directions of its arms (degrees), who waits.
-
-    Attributes:
-      x, y, height: m.
-      directions: of the arms by name, degrees counter-clockwise from east, outwards.
-      stops, yields: arms with such a sign.
-      room: from its middle to the arms, m.
-    """
-
-    x: float
-    y: float
-    height: float
-    directions: dict[str, float]
-    stops: str = ""
-    yields: str = ""
-    room: float = ROOM
-
-    def exit(self, name: str) -> Pose:
-        """Where an arm begins, looking outwards."""
-        direction = math.radians(self.directions[name])
-        return Pose(self.x, self.y, geometry.wrap(direction)).ahead(self.room)
 
 
 NODES = {
@@ -82,18 +52,14 @@ def build() -> Town:
         ("Ee", "Fe", [(210, 32, 0), (275, -45, -90), (230, -118, -160)], "road"),
         ("Ss", "Ww", [(-40, -215, 185), (-130, -190, 155), (-216, -95, 95)], "road"),
     ):
-        _add_link(town, arms, (start, goal), [_pose(*each) for each in via], kind)
+        _add_link(town, arms, (start, goal), [pose(*each) for each in via], kind)
     for name, node in NODES.items():
         if name == "C":
-            _add_roundabout(town, node, arms[name])
+            add_roundabout(town, node, arms[name])
         else:
-            _add_crossing(town, node, arms[name])
+            add_crossing(town, node, arms[name])
     signs.add_speed_signs(town)
     return town
-
-
-def _pose(x: float, y: float, degrees: float) -> Pose:
-    return Pose(float(x), float(y), math.radians(degrees))
 
 
 def _add_link(
@@ -168,45 +134,3 @@ def _bay(length: float) -> LaneSpec:
         ease(length - taper, PARKING, 0.0, taper),
     )
     return LaneSpec("parking", widths)
-
-
-def _add_crossing(town: Town, node: Node, at: dict[str, Arm]) -> None:
-    junction = add_junction(town, list(at.values()), node.height)
-    connect_all(town, junction)
-    for name, arm in at.items():
-        if name in node.stops + node.yields:
-            kind = signs.STOP if name in node.stops else signs.YIELD
-            signs.add_sign(town, arm, junction.connections, kind)
-            signs.add_stop_line(town, arm)
-        if name in node.stops:
-            signs.add_crosswalk(town, arm, junction.connections)
-
-
-def _add_roundabout(town: Town, node: Node, at: dict[str, Arm]) -> None:
-    """A ring of one-way roads; a junction at every arm joins it with the ways in and out."""
-    names = sorted(at, key=lambda name: node.directions[name])
-    ring = [
-        _ring_road(town, node, node.directions[a], node.directions[b])
-        for a, b in zip(names, names[1:] + names[:1], strict=True)
-    ]
-    for index, name in enumerate(names):
-        arm = at[name]
-        parts = [arm, Arm(ring[index - 1], "end"), Arm(ring[index], "start")]
-        junction = add_junction(town, parts, node.height)
-        connect_all(town, junction)
-        signs.add_sign(town, arm, junction.connections, signs.YIELD)
-
-
-def _ring_road(town: Town, node: Node, first: float, second: float) -> Road:
-    """The stretch of the ring between two arms, given by their directions in degrees."""
-    radius = RING_RADIUS - RING_WIDTH / 2
-    start = math.radians(first) + RING_HALF
-    angle = math.radians((second - first) % 360) - 2 * RING_HALF
-    middle = Pose(node.x, node.y, geometry.wrap(start))
-    path = geometry.chain(
-        middle.ahead(radius).turned(math.pi / 2), (radius * angle, 1 / radius, 1 / radius)
-    )
-    lanes = (lane("driving", RING_WIDTH, SOLID), lane("shoulder", 1.0), lane("sidewalk", 2.0))
-    section = Section(0.0, (), lanes, SOLID)
-    heights = ((0.0, node.height, 0.0, 0.0, 0.0),) if node.height else ()
-    return town.add_road(path, [section], STREET_SPEED, heights=heights)

@@ -7,7 +7,7 @@ from importlib import resources
 
 # Which of the bundled towns a policy may learn in, and which are kept for scoring.
 TRAINING = ("grid", "highway", "village")
-HELD_OUT: tuple[str, ...] = ()
+HELD_OUT: tuple[str, ...] = ("suburb",)
 
 
 def names() -> tuple[str, ...]:
