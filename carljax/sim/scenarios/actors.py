@@ -246,7 +246,7 @@ def put_others(others: Agents, appears: jax.Array, script: ScriptedOthers) -> Ag
 
 def starts_moving(script: ScriptedOthers, cues: Cues, scene: Scene) -> jax.Array:
     """(n,) bool: the ego has come near enough, in time or in space."""
-    plays = cues.is_active & (cues.triggered_s >= 0.0)
+    plays = cues.is_active & (cues.triggered_s >= 0.0) & (script.kind != KIND_NONE)
     soon = time_to(script.meet_s, scene) < script.start_time
     near = script.meet_s - scene.route_s < script.start_distance
     return plays & (soon | near)

@@ -189,7 +189,8 @@ def _has_room(coming: Scenario, agents: Agents, scene: Scene) -> jax.Array:
     cars, others = coming.cars, coming.others
     here = (cars.model >= 0) & ~cars.from_trigger & (cars.drive != DRIVE_FLOW)
     at = actors.car_start(cars, scene.road_map).xy
-    room = ~here | actors.may_appear(at, actors.car_length(cars), actors.CAR_GAP, agents, scene)
+    vehicles = population.rows(agents, scene.rows.vehicles)
+    room = ~here | actors.may_appear(at, actors.car_length(cars), actors.CAR_GAP, vehicles, scene)
     stands = others.kind != KIND_NONE
     free = actors.may_appear(others.xy, others.length, actors.OTHER_GAP, agents, scene)
     return room.all() & (~stands | free).all()
@@ -262,7 +263,8 @@ def _cars(
     came = actors.way(cars, flat, scene.road_map)
     waits = actors.waiting(cars, slots.has_appeared.reshape(-1), flat, cues, came)
     at = actors.car_start(flat, scene.road_map)
-    able = actors.may_appear(at.xy, actors.car_length(flat), actors.CAR_GAP, agents, scene)
+    vehicles = population.rows(agents, scene.rows.vehicles)
+    able = actors.may_appear(at.xy, actors.car_length(flat), actors.CAR_GAP, vehicles, scene)
     able &= ~cars.valid | actors.is_hidden(cars.xy, scene)
     starts = actors.one_at_a_time(at.xy, waits & able)
     cars = actors.put_cars(cars, starts, flat, at, scene.road_map)
