@@ -58,11 +58,13 @@ def place(site: Site, rng: np.random.Generator) -> Scenario | None:
 def _lanes(site: Site, first: int, last: int) -> list[int] | None:
     """The route's lanes between two of its points; None where it changes lanes or has over three.
 
-    A car knows three lanes of its way.
+    A car knows three lanes of its way, and would stand where it knows no more: if the route has
+    fewer there, it goes on as it likes.
     """
+    table = site.town.lanes
     lane = np.asarray(site.route.lane[first : last + 1]) - site.first.lane
     ordered = lane[np.r_[True, lane[1:] != lane[:-1]]].tolist()
-    follow = all(
-        after in site.town.lanes.successors[before] for before, after in itertools.pairwise(ordered)
-    )
+    follow = all(after in table.successors[before] for before, after in itertools.pairwise(ordered))
+    while len(ordered) < 3 and table.successors[ordered[-1]].max() >= 0:
+        ordered.append(int(table.successors[ordered[-1]].max()))
     return ordered if follow and len(ordered) <= 3 else None
