@@ -14,7 +14,6 @@ import numpy as np
 
 from carljax.sim.route import Route
 from carljax.sim.scenarios import registry
-from carljax.sim.scenarios import site as site_module
 from carljax.sim.scenarios.script import DRIVE_LEGAL, Scenario
 from carljax.sim.scenarios.site import Site
 from carljax.sim.town import Offsets, Town
@@ -22,9 +21,6 @@ from carljax.sim.town import Offsets, Town
 SPACING = 100.0  # m. source: paper, Scenario Generation
 START_ROOM = 20  # route points before the first trigger, so that the ego has set off. source: ours
 END_ROOM = 60  # route points after the last trigger, in which it can play. source: ours
-# m from the trigger to the junction at least, for kinds that need one. source: ours, so that the
-# ego comes while it happens
-JUNCTION_ROOM = 30.0
 # Kinds that few places suit: they need a certain junction, and a certain way through it.
 RARE = frozenset(
     (
@@ -79,14 +75,11 @@ def _order(kinds: Sequence[str], rng: np.random.Generator) -> list[str]:
 
 
 def _try(kind: str, site: Site, rng: np.random.Generator) -> Scenario | None:
-    """One try of one kind at one place."""
-    if site.index < START_ROOM:
+    """One try of one kind at one place; kinds at junctions move their trigger somewhat."""
+    found = registry.place(kind, site, rng)
+    if found is None or found.trigger_s < site.route.s[START_ROOM]:
         return None
-    if kind in AT_JUNCTION:
-        crossing = site_module.next_junction(site)
-        if crossing is None or crossing.entry_s - site.trigger_s < JUNCTION_ROOM:
-            return None
-    return registry.place(kind, site, rng)
+    return found
 
 
 def clash(one: Scenario, other: Scenario) -> bool:

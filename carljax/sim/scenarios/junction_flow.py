@@ -31,9 +31,10 @@ OUT_OF_SIGHT = 65.0
 SHORTEST_ARM = 45.0  # m; a shorter arm brings its cars into sight too suddenly. source: ours
 ARM_CLEARANCE = 4.0  # m kept to an arm's beginning. source: ours
 FARTHEST_SINK = 90.0  # m beyond the junction, out of sight. source: ours
-# m from the trigger to the junction where the site is farther away: the ego comes while it happens.
-# source: ours
-TRIGGER_AHEAD = (30.0, 70.0)
+# m from the trigger to the junction. source: ours
+TRIGGER_AHEAD = (20.0, 110.0)
+# s by which an ego at the limit comes after the first car of the stream may. source: ours
+LATE = (0.0, 4.0)
 SAME_DIRECTION = np.pi / 4  # rad by which an arm may differ from the side it is on. source: ours
 
 
@@ -92,7 +93,6 @@ def place(
     crossing = site_module.next_junction(site)
     if crossing is None or crossing.way != stream.way:
         return None
-    site = near(site, crossing, rng)
     light = ego_light(site, crossing)
     if (light >= 0) != is_signalized:
         return None
@@ -101,22 +101,40 @@ def place(
         return None
     across = found[int(rng.integers(len(found)))]
     speed = float(rng.triangular(*stream.speed))
-    cars = _cars(site, across, stream, speed, rng.uniform(*GAP, NUM_CARS - 1))
-    if cars is None:
+    gaps = rng.uniform(*GAP, NUM_CARS - 1)
+    round_ = _round(across, stream, speed, gaps)
+    if round_ is None:
         return None
-    scenario = site_module.blank(site, crossing.exit_s + END_BEYOND, TIMEOUT).replace(cars=cars)
+    soonest = (across.meet_lane_s - round_.source) / speed
+    site = trigger(site, crossing, across, soonest + float(rng.uniform(*LATE)))
+    wait = time_at_limit(site, crossing, across) - soonest
+    scenario = site_module.blank(site, crossing.exit_s + END_BEYOND, TIMEOUT)
+    _put_cars(site, scenario.cars, across, round_, speed, wait)
     if not is_signalized:
         return scenario
     green = [row for row in (light, across.light) if row >= 0]
     return site_module.hold(site, scenario, crossing.junction, green)
 
 
-def near(site: Site, crossing: RouteJunction, rng: np.random.Generator) -> Site:
-    """The site, or one nearer to the junction where it is too far for what happens there."""
-    trigger_s = crossing.entry_s - float(rng.uniform(*TRIGGER_AHEAD))
-    if crossing.entry_s - site.trigger_s < TRIGGER_AHEAD[1]:
-        return site
+def trigger(site: Site, crossing: RouteJunction, across: CrossWay, time: float) -> Site:
+    """The site moved along its route to where an ego at the limit needs some time to the meeting.
+
+    Args:
+      site: before the junction.
+      crossing: the junction.
+      across: the way that the route meets there.
+      time: s.
+    """
+    limit = float(site.route.speed_limit[crossing.entry])
+    least, most = TRIGGER_AHEAD
+    ahead = limit * time - (across.meet_s - crossing.entry_s)
+    trigger_s = crossing.entry_s - min(max(ahead, least), most)
     return dataclasses.replace(site, index=site_module.place_at(site, trigger_s).index)
+
+
+def time_at_limit(site: Site, crossing: RouteJunction, across: CrossWay) -> float:
+    """S from the trigger to the meeting for an ego at the limit."""
+    return (across.meet_s - site.trigger_s) / float(site.route.speed_limit[crossing.entry])
 
 
 def ego_light(site: Site, crossing: RouteJunction) -> int:
@@ -171,32 +189,60 @@ def _cross_way(site: Site, crossing: RouteJunction, lane: int) -> CrossWay | Non
     )
 
 
-def _cars(
-    site: Site, across: CrossWay, stream: Stream, speed: float, gaps: np.ndarray
-) -> ScriptedCars | None:
-    """As many cars as the way has room for in one round, at least two."""
+@dataclasses.dataclass(frozen=True)
+class _Round:
+    """One round of a stream.
+
+    Attributes:
+      source: m along the way, where cars begin.
+      travel: m along the way, where they begin again.
+      behind: (n,) m, how far each car follows the first.
+    """
+
+    source: float
+    travel: float
+    behind: np.ndarray
+
+
+def _round(across: CrossWay, stream: Stream, speed: float, gaps: np.ndarray) -> _Round | None:
+    """As many cars as the way has room for, at least two."""
     source = across.source(max(stream.source_time * speed, OUT_OF_SIGHT))
     nearest = across.exit + stream.sink_time * speed
     farthest = min(across.way.length, across.exit + FARTHEST_SINK)
     if nearest > farthest:
         return None
     last = max(GAP[1], GAP_TO_GO * speed)
-    begins = np.concatenate([[0.0], np.cumsum(gaps)])
-    begins = begins[begins + last <= farthest - source]
-    if len(begins) < 2:
+    behind = np.concatenate([[0.0], np.cumsum(gaps)])
+    behind = behind[behind + last <= farthest - source]
+    if len(behind) < 2:
         return None
-    travel = max(source + begins[-1] + last, nearest)
-    num = len(begins)
-    cars = site_module.blank(site, 0.0, 0.0).cars
-    rows = slice(0, num)
+    return _Round(source, max(source + float(behind[-1]) + last, nearest), behind)
+
+
+def _put_cars(
+    site: Site, cars: ScriptedCars, across: CrossWay, round_: _Round, speed: float, wait: float
+) -> None:
+    """Fills in the cars of a stream.
+
+    Args:
+      site: its place.
+      cars: empty rows.
+      across: its way.
+      round_: its cars.
+      speed: m/s.
+      wait: s after the trigger at which a car has to leave the source in order to meet an ego at
+        the limit. One of the stream does, and as many as there is time for come before it.
+    """
+    rows = slice(0, len(round_.behind))
+    after = round_.behind / speed
+    before = after[after <= max(wait, 0.0)]
     cars.model[rows] = CAR
     cars.lanes[rows] = site_module.shared_lanes(site, across.way.lanes)
-    cars.s[rows] = source
+    cars.s[rows] = round_.source
     cars.speed[rows] = speed
     cars.drive[rows] = DRIVE_FLOW
-    cars.travel[rows] = travel
+    cars.travel[rows] = round_.travel
     cars.meet_s[rows] = across.meet_s
     cars.meet_lane_s[rows] = across.meet_lane_s
     cars.from_trigger[rows] = True
-    cars.delay[rows] = begins / speed
-    return cars
+    cars.delay[rows] = after + max(wait, 0.0) - before[-1]

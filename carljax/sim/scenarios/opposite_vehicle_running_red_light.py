@@ -10,7 +10,6 @@ import numpy as np
 
 from carljax.sim.scenarios import junction_flow
 from carljax.sim.scenarios import site as site_module
-from carljax.sim.scenarios.junction_flow import CrossWay
 from carljax.sim.scenarios.script import DRIVE_MEET, Scenario
 from carljax.sim.scenarios.site import Site
 from carljax.sim.types import SIGNAL_EMERGENCY
@@ -18,6 +17,9 @@ from carljax.sim.vehicles import VAN
 
 SPEED = 60.0 / 3.6  # m/s. source: CARLA's scenario
 TIMEOUT = 180.0  # s. source: CARLA's scenario
+# of the time that the car needs at its own speed, in which an ego at the limit comes to the meeting
+# place: the car can be somewhat slower, and faster. source: ours
+EGO_TIME = (0.9, 1.4)
 END_BEYOND = 10.0  # m beyond the junction. source: CARLA's turns at junctions
 
 
@@ -28,7 +30,6 @@ def place(site: Site, rng: np.random.Generator) -> Scenario | None:
     from_left_first = rng.random() < 0.5
     if crossing is None:
         return None
-    site = junction_flow.near(site, crossing, rng)
     light = junction_flow.ego_light(site, crossing)
     if light < 0:
         return None
@@ -45,20 +46,19 @@ def place(site: Site, rng: np.random.Generator) -> Scenario | None:
     found = first or second
     if not found:
         return None
-    scenario = _runner(site, found[int(rng.integers(len(found)))], crossing.exit_s + END_BEYOND)
-    return site_module.hold(site, scenario, crossing.junction, [light])
-
-
-def _runner(site: Site, across: CrossWay, end_s: float) -> Scenario:
-    scenario = site_module.blank(site, end_s, TIMEOUT)
+    across = found[int(rng.integers(len(found)))]
+    source = across.source(junction_flow.OUT_OF_SIGHT)
+    time = (across.meet_lane_s - source) / SPEED
+    site = junction_flow.trigger(site, crossing, across, time * float(rng.uniform(*EGO_TIME)))
+    scenario = site_module.blank(site, crossing.exit_s + END_BEYOND, TIMEOUT)
     cars = scenario.cars
     cars.model[0] = VAN
     cars.lanes[0] = site_module.shared_lanes(site, across.way.lanes)
-    cars.s[0] = across.source(junction_flow.OUT_OF_SIGHT)
+    cars.s[0] = source
     cars.speed[0] = SPEED
     cars.drive[0] = DRIVE_MEET
     cars.meet_s[0] = across.meet_s
     cars.meet_lane_s[0] = across.meet_lane_s
     cars.signals[0] = SIGNAL_EMERGENCY
     cars.from_trigger[0] = True
-    return scenario
+    return site_module.hold(site, scenario, crossing.junction, [light])
