@@ -17,6 +17,7 @@ from carljax.sim.scenarios import actors
 from carljax.sim.scenarios.actors import Cues, Scene
 from carljax.sim.scenarios.script import (
     DRIVE_FLOW,
+    DRIVE_MEET,
     NUM_CARS,
     NUM_OTHERS,
     Scenario,
@@ -226,7 +227,9 @@ def _end(
     ends = over & (jnp.cumsum(over) == 1)
     cars = population.rows(agents, scene.rows.cars)
     behind = geometry.to_frame(cars.xy, scene.ego.xy, scene.ego.yaw)[:, 0] < 0.0
-    flashes = (actors.flat(script.cars).signals & SIGNAL_EMERGENCY) > 0
+    flat = actors.flat(script.cars)
+    # Nobody can give way to one that crosses: only what comes along the ego's own way counts.
+    flashes = ((flat.signals & SIGNAL_EMERGENCY) > 0) & (flat.drive != DRIVE_MEET)
     follows = (cars.valid & behind & flashes).reshape(-1, NUM_CARS).any(axis=1)
     slots = slots.replace(
         is_leaving=slots.is_leaving | ends,
