@@ -6,7 +6,7 @@ import pathlib
 import numpy as np
 import pytest
 from small_world import lane, network, road, straight
-from walking_world import street
+from walking_world import inside, street, to_pavement
 
 from carljax.sim import atlas, road_map_builder, town, walk_graph
 from carljax.sim.road_map import (
@@ -54,33 +54,6 @@ def along(graph, pairs, num=41):
     """(E, num, 2) places on edges, the ends included."""
     start, end = graph.xyz[pairs[:, 0], None, :2], graph.xyz[pairs[:, 1], None, :2]
     return start + np.linspace(0, 1, num)[:, None] * (end - start)
-
-
-def to_pavement(net, xy):
-    """(n,) m from places to the edge of the nearest pavement, negative on it."""
-    best = np.full(len(xy), 50.0)
-    for one in net.lanes:
-        if one.kind != "sidewalk":
-            continue
-        low, high = one.xyz[:, :2].min(axis=0) - 10, one.xyz[:, :2].max(axis=0) + 10
-        near = np.flatnonzero(((xy > low) & (xy < high)).all(axis=1))
-        a, d = one.xyz[:-1, :2], np.diff(one.xyz[:, :2], axis=0)
-        t = np.einsum("npi,pi->np", xy[near, None] - a, d) / np.maximum((d**2).sum(axis=1), 1e-12)
-        foot = a + np.clip(t, 0, 1)[..., None] * d
-        away = np.hypot(*np.moveaxis(xy[near, None] - foot, -1, 0)) - one.width[:-1] / 2
-        best[near] = np.minimum(best[near], away.min(axis=1, initial=50.0))
-    return best
-
-
-def inside(polygon, xy):
-    """Whether places (n, 2) lie in a polygon: an odd number of its sides lies to their right."""
-    odd = np.zeros(len(xy), bool)
-    for (x0, y0), (x1, y1) in zip(polygon, np.roll(polygon, -1, axis=0), strict=True):
-        spans = (y0 > xy[:, 1]) != (y1 > xy[:, 1])
-        with np.errstate(divide="ignore", invalid="ignore"):
-            at = x0 + (xy[:, 1] - y0) / (y1 - y0) * (x1 - x0)
-        odd ^= spans & (xy[:, 0] < at)
-    return odd
 
 
 def test_nodes_lie_on_pavements(there):

@@ -7,8 +7,6 @@ pavement's edge, so at y = -4.1 and 4.1.
 
 from __future__ import annotations
 
-import functools
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -100,8 +98,33 @@ def crowds(graph, radius_at, num, rng):
     return jax.tree.map(lambda *x: jnp.asarray(np.stack(x)), *kept)
 
 
+def to_pavement(net, xy):
+    """(n,) m from places to the edge of the nearest pavement, negative on it."""
+    best = np.full(len(xy), 50.0)
+    for one in net.lanes:
+        if one.kind != "sidewalk":
+            continue
+        low, high = one.xyz[:, :2].min(axis=0) - 10, one.xyz[:, :2].max(axis=0) + 10
+        near = np.flatnonzero(((xy > low) & (xy < high)).all(axis=1))
+        a, d = one.xyz[:-1, :2], np.diff(one.xyz[:, :2], axis=0)
+        t = np.einsum("npi,pi->np", xy[near, None] - a, d) / np.maximum((d**2).sum(axis=1), 1e-12)
+        foot = a + np.clip(t, 0, 1)[..., None] * d
+        away = np.hypot(*np.moveaxis(xy[near, None] - foot, -1, 0)) - one.width[:-1] / 2
+        best[near] = np.minimum(best[near], away.min(axis=1, initial=50.0))
+    return best
+
+
+def inside(polygon, xy):
+    """Whether places (n, 2) lie in a polygon: an odd number of its sides lies to their right."""
+    odd = np.zeros(len(xy), bool)
+    for (x0, y0), (x1, y1) in zip(polygon, np.roll(polygon, -1, axis=0), strict=True):
+        spans = (y0 > xy[:, 1]) != (y1 > xy[:, 1])
+        with np.errstate(divide="ignore", invalid="ignore"):
+            at = x0 + (xy[:, 1] - y0) / (y1 - y0) * (x1 - x0)
+        odd ^= spans & (xy[:, 0] < at)
+    return odd
+
+
 initial = jax.jit(pedestrians.initial)
 stroll_jit = jax.jit(stroll, static_argnums=5)
-live_all = jax.jit(
-    jax.vmap(functools.partial(live), in_axes=(None, 0, 0, 0, 0, None)), static_argnums=5
-)
+live_all = jax.jit(jax.vmap(live, in_axes=(None, 0, 0, 0, 0, None)), static_argnums=5)
