@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from carljax.planners import controls, forecast, gate, leader, pace, stops
+from carljax.planners import controls, forecast, gate, lane_change, leader, pace, stops
 from carljax.planners import way as way_module
 from carljax.planners.way import Way
 from carljax.sim import idm
@@ -48,15 +48,21 @@ Respond = Callable[[jax.Array, jax.Array | float, IDMParams], jax.Array]
 
 
 class Memory(struct.PyTreeNode):
-    """What it remembers: waited_s () s, how long it has stood."""
+    """What it remembers.
+
+    Attributes:
+      waited_s: () s, how long it has stood.
+      delay: () m, by which it puts off changes of lane.
+    """
 
     waited_s: jax.Array
+    delay: jax.Array
 
 
 def init(env: DrivingEnv) -> Memory:
     """Memory at the start of a route."""
     del env
-    return Memory(waited_s=jnp.float32(0.0))
+    return Memory(waited_s=jnp.float32(0.0), delay=jnp.float32(0.0))
 
 
 def act(env: DrivingEnv, sim: SimState, memory: Memory) -> tuple[jax.Array, Memory]:
@@ -71,7 +77,7 @@ def act(env: DrivingEnv, sim: SimState, memory: Memory) -> tuple[jax.Array, Memo
       (2,) float32 in [-1, 1], steering and pedals; the memory for the next step.
     """
     car, ego, road_map = env.vehicle, sim.ego, env.bank.road_map
-    found = way_module.stretch(env, sim)
+    found = way_module.stretch(env, sim, memory.delay)
     way = way_module.ahead(found)
     speeds = desired_speeds(way)
     desired = pace.at(speeds, ego.speed * env.config.dt)
@@ -83,10 +89,12 @@ def act(env: DrivingEnv, sim: SimState, memory: Memory) -> tuple[jax.Array, Memo
     light = respond(stops.lights(sim, found, way, road_map, car), 0.0, AT_LIGHT)
     sign = respond(stops.signs(sim, found, way, car), 0.0, AT_SIGN)
     for_others = _for_others(env, sim, way, speeds, memory, respond)
-    accel = jnp.minimum(jnp.minimum(light, sign), for_others)
+    delay, room = lane_change.postpone(found, ego, sim.agents, memory.delay, road_map, car)
+    merge = respond(room, 0.0, AT_GATE)
+    accel = jnp.stack([light, sign, for_others, merge]).min()
     accel = _comfortable(accel, ego.accel)
     waited = jnp.where(ego.speed < 0.3, memory.waited_s + env.config.dt, 0.0)
-    return controls.action(ego, way, accel, car), Memory(waited_s=waited)
+    return controls.action(ego, way, accel, car), Memory(waited, delay)
 
 
 def desired_speeds(way: Way) -> jax.Array:

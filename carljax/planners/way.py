@@ -1,7 +1,8 @@
 """The way ahead: the ego's route from where it is, sampled every metre, fit to be driven.
 
 A route jumps from lane to lane where it changes lane. Its points are shifted here, so that the jump
-becomes a smooth change over some tens of metres; elsewhere they stay where they are.
+becomes a smooth change over some tens of metres, there or later; elsewhere they stay where they
+are.
 """
 
 from __future__ import annotations
@@ -22,6 +23,9 @@ JUMP = 1.0  # m sideways between two route points: no bend is so tight, no lane 
 # m before and after the jump over which a lane is changed. source: ours; at 0.72 * 80 km/h it takes
 # 2.5 s and a lateral acceleration of 3.5 m/s^2
 CHANGE_LENGTH = 20
+# Points of the route kept behind the ego, beyond those of `route.WINDOW_BACK`: changes that are put
+# off lie there.
+MORE_BACK = 48
 _HUMP = 1.0 + np.cos(np.linspace(-np.pi, np.pi, 2 * CHANGE_LENGTH + 1))
 _HUMP = (_HUMP / _HUMP.sum()).astype(np.float32)
 
@@ -57,23 +61,35 @@ class Stretch(struct.PyTreeNode):
       route: a window of it.
       xy: (W, 2) m, its points with lane changes drawn out.
       at: () where the ego is, in points from the window's start.
+      sideways: (W,) m to the left by which the route jumps to each point, 0 where it does not.
     """
 
     route: Route
     xy: jax.Array
     at: jax.Array
+    sideways: jax.Array
 
 
-def stretch(env: DrivingEnv, sim: SimState) -> Stretch:
-    """Finds the ego on its route; past the last point the route goes straight on."""
-    window, first = route.window(env.bank.routes, sim.episode_idx, sim.route_idx)
-    xy = smooth(window)
+def stretch(env: DrivingEnv, sim: SimState, delay: jax.Array | float = 0.0) -> Stretch:
+    """Finds the ego on its route.
+
+    Args:
+      env: the environment.
+      sim: its state.
+      delay: () m by which changes of lane are put off.
+
+    Returns:
+      The route around the ego.
+    """
+    window, first = route.window(env.bank.routes, sim.episode_idx, sim.route_idx - MORE_BACK)
+    sideways = jumps(window)
+    xy = smooth(window, sideways, delay)
     near = sim.route_idx - first + jnp.arange(-NEAR_BACK, NEAR_AHEAD)
     near = jnp.clip(near, 0, window.num_points - 1)
     offset = sim.ego.xy - xy[near]
     nearest = near[jnp.argmin((offset**2).sum(axis=1))]
     along = geometry.to_frame(sim.ego.xy, xy[nearest], window.yaw[nearest])[0]
-    return Stretch(route=window, xy=xy, at=jnp.maximum(nearest + along, 0.0))
+    return Stretch(window, xy, jnp.maximum(nearest + along, 0.0), sideways)
 
 
 def ahead(found: Stretch) -> Way:
@@ -110,22 +126,35 @@ def ahead(found: Stretch) -> Way:
     )
 
 
-def smooth(window: Route) -> jax.Array:
-    """(W, 2) m, route points with lane changes drawn out.
-
-    What lies to the left of where the route began is a staircase along it; the points are moved by
-    the difference between that staircase, averaged under a hump, and the staircase itself.
-    """
+def jumps(window: Route) -> jax.Array:
+    """(W,) m, see `Stretch.sideways`."""
     num = window.xy.shape[0]
     sideways = geometry.to_frame(window.xy[1:], window.xy[:-1], window.yaw[:-1])[:, 1]
     is_jump = (jnp.abs(sideways) > JUMP) & (jnp.arange(1, num) < window.num_points)
-    stairs = jnp.cumsum(jnp.where(is_jump, sideways, 0.0))
-    stairs = jnp.concatenate([jnp.zeros(1, jnp.float32), stairs])
+    return jnp.pad(jnp.where(is_jump, sideways, 0.0), (1, 0))
+
+
+def smooth(window: Route, sideways: jax.Array, delay: jax.Array | float = 0.0) -> jax.Array:
+    """(W, 2) m, route points with lane changes drawn out.
+
+    What lies to the left of where the route began is a staircase along it; the points are moved by
+    the difference between that staircase, averaged under a hump and put off, and the staircase
+    itself.
+
+    Args:
+      window: of the route.
+      sideways: (W,) m, its `jumps`.
+      delay: () m by which changes are put off.
+    """
+    num = window.xy.shape[0]
+    stairs = jnp.cumsum(sideways)
     padded = jnp.pad(stairs, CHANGE_LENGTH, mode="edge")
-    averaged = sum(w * padded[k : k + num] for k, w in enumerate(_HUMP))
-    shift = averaged - stairs
+    averaged = jnp.stack([w * padded[k : k + num] for k, w in enumerate(_HUMP)]).sum(axis=0)
+    at = jnp.clip(jnp.arange(num, dtype=jnp.float32) - delay, 0.0, num - 1.0)
+    base = jnp.minimum(at.astype(jnp.int32), num - 2)
+    put_off = averaged[base] + (at - base) * (averaged[base + 1] - averaged[base])
     left = jnp.stack([-jnp.sin(window.yaw), jnp.cos(window.yaw)], axis=-1)
-    return window.xy + shift[:, None] * left
+    return window.xy + (put_off - stairs)[:, None] * left
 
 
 def pose(way: Way, distance: jax.Array) -> tuple[jax.Array, jax.Array]:

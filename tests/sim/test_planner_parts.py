@@ -8,7 +8,7 @@ import shapely
 from small_world import LEFT_RADIUS
 from traffic_world import cars, f32, make_ego, with_values
 
-from carljax.planners import controls, forecast, gate, leader, pace
+from carljax.planners import controls, forecast, gate, lane_change, leader, pace
 from carljax.planners import way as way_module
 from carljax.planners.way import SAMPLES, Way
 from carljax.sim import bicycle, lights, route
@@ -25,6 +25,7 @@ slowed_before = jax.jit(pace.slowed_before)
 wanted = jax.jit(pace.wanted)
 ego_distances = jax.jit(forecast.ego_distances, static_argnums=3)
 next_gate = jax.jit(gate.next_gate)
+postpone = jax.jit(lane_change.postpone)
 
 
 def way_along(xy, yaw, curvature):
@@ -147,7 +148,7 @@ def test_a_lane_change_is_drawn_out(radius, aside):
     middle = radius * np.stack([np.sin(angle), 1.0 - np.cos(angle)], axis=-1)
     raw = middle + np.where(np.arange(176) > 60, aside, 0.0)[:, None] * left
     window = _route(raw, angle)
-    xy = np.asarray(way_module.smooth(window), float)
+    xy = np.asarray(way_module.smooth(window, way_module.jumps(window)), float)
     moved = ((xy - middle) * left).sum(axis=1)
     # Nobody moves beyond 20 m before and after; half way over between the two points.
     np.testing.assert_allclose(moved[:40], 0.0, atol=1e-3)
@@ -161,7 +162,7 @@ def test_a_lane_change_is_drawn_out(radius, aside):
 def test_the_way_begins_beside_the_ego_and_goes_on_past_the_end():
     xy = np.stack([np.arange(10.0), np.full(10, 2.0)], axis=-1)
     window = _route(xy, np.zeros(10))
-    found = way_module.Stretch(route=window, xy=f32(xy), at=f32(3.4))
+    found = way_module.Stretch(route=window, xy=f32(xy), at=f32(3.4), sideways=jnp.zeros(10))
     way = way_module.ahead(found)
     np.testing.assert_allclose(way.xy[:, 0], 3.4 + np.arange(SAMPLES), atol=1e-4)
     np.testing.assert_allclose(way.xy[:, 1], 2.0, atol=1e-5)
@@ -197,6 +198,54 @@ def _route(xy, yaw):
         sign_idx=jnp.array([-1, -1]),
         sign_limit=jnp.zeros(2),
     )
+
+
+def test_a_lane_change_is_put_off():
+    raw = np.stack([np.arange(176.0), np.where(np.arange(176) > 60, 3.5, 0.0)], axis=-1)
+    window = _route(raw, np.zeros(176))
+    sideways = way_module.jumps(window)
+    now, later = (np.asarray(way_module.smooth(window, sideways, x)) for x in (0.0, 10.0))
+    np.testing.assert_allclose(later[30:, 1], now[20:-10, 1], atol=1e-4)
+
+
+# Car 1 m to 60 m along the lane that the route jumps to at 100; the ego is at 78 and goes 10 m/s,
+# the change begins at 80, and it decides from 3 + 10 m before.
+@pytest.mark.parametrize(
+    ("s", "speed", "on", "blocks"),
+    [
+        (78.0, 10.0, 1, True),  # beside
+        (48.0, 10.0, 1, False),  # 25.6 m behind and no faster: 3 + 0.3 * 10 m are enough
+        (66.0, 10.0, 1, False),  # 7.6 m behind, no faster
+        (66.0, 12.0, 1, True),  # 7.6 m behind, needs 3 + 0.3 * 12 + 2.5 * 2 = 11.6 m
+        (86.0, 10.0, 1, True),  # 3.6 m ahead
+        (86.0, 10.0, 0, False),  # on the ego's own lane
+        (98.0, 2.0, 1, True),  # 15.6 m ahead, needs 3 + 0.3 * 10 + 2.5 * 8 = 26 m
+    ],
+)
+def test_a_lane_change_waits_for_room(world, s, speed, on, blocks):
+    raw = np.stack([np.arange(176.0), np.where(np.arange(176) > 99, 3.5, 0.0)], axis=-1)
+    window = _route(raw, np.zeros(176))
+    window = window.replace(lane=jnp.where(jnp.arange(176) > 99, 1, 0))
+    sideways = way_module.jumps(window)
+    found = way_module.Stretch(window, f32(raw), f32(78.0), sideways)
+    values = {"lanes": [[on, -1, -1]], "lane_s": [s], "speed": [speed], "length": [4.0]}
+    agents = with_values(1, {**values, "kind": [KIND_VEHICLE]})
+    ego = make_ego((78.0, 0.0), 0.0, 10.0)
+    delay, wait = postpone(found, ego, agents, f32(0.0), world.map, CAR)
+    if blocks:
+        # It stays 13 m ahead, and could be put off by 44 m.
+        assert float(delay) == pytest.approx(78 + 13 - 80)
+        assert float(wait) == pytest.approx(80 + 44 - 78)
+    else:
+        assert float(delay) == 0.0 and np.isinf(wait)
+    # A junction from 130 on: it has to be over 3 m before, 7 m later than planned at most.
+    near = found.replace(route=window.replace(in_junction=jnp.arange(176) >= 130))
+    assert float(postpone(near, ego, agents, f32(0.0), world.map, CAR)[0]) == 7.0 * blocks
+    # Once it has begun it goes on, and one that lies behind does not put the next one off.
+    begun = found.replace(at=f32(90.0))
+    assert float(postpone(begun, ego, agents, f32(5.0), world.map, CAR)[0]) == 5.0
+    past = found.replace(at=f32(130.0))
+    assert float(postpone(past, ego, agents, f32(5.0), world.map, CAR)[0]) == 0.0
 
 
 # Who is in the way
