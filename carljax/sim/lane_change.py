@@ -16,7 +16,7 @@ from flax import struct
 from carljax.sim import geometry, idm, vehicles
 from carljax.sim.idm import IDMParams
 from carljax.sim.lane_plan import plan
-from carljax.sim.lane_shift import AT_ONCE, FAR, with_leaving
+from carljax.sim.lane_shift import AT_ONCE, FAR, changing, with_leaving
 from carljax.sim.right_of_way import Mover, planned_lane
 from carljax.sim.road_map import RoadMap
 from carljax.sim.types import Agents
@@ -36,20 +36,36 @@ ROOM, ROOM_TIME = 20.0, 3.5  # m and s at the present speed that a change needs 
 LANE_ENDS = 150.0  # m before its end a lane is left. source: ours, about where signs warn
 
 
+class Others(struct.PyTreeNode):
+    """Whom a car may come between, (N + 1 + AT_ONCE,): agents, the ego, cars that leave a lane.
+
+    Attributes:
+      mover: where they are.
+      desired: m/s, free speed.
+      driver: their driver model, arrays like the others.
+    """
+
+    mover: Mover
+    desired: jax.Array
+    driver: IDMParams
+
+
 class Gaps(struct.PyTreeNode):
     """Whom a place on a lane has before and behind it, (M,).
 
     Attributes:
       ahead, behind: m between bumpers, FAR where there is nobody.
-      leader_speed, follower_speed: m/s.
-      follower: int32, row of `Mover`.
+      leader_speed: m/s.
+      follower_speed, follower_desired: m/s.
+      follower: its driver model.
     """
 
     ahead: jax.Array
     behind: jax.Array
     leader_speed: jax.Array
     follower_speed: jax.Array
-    follower: jax.Array
+    follower_desired: jax.Array
+    follower: IDMParams
 
 
 class Change(struct.PyTreeNode):
@@ -126,7 +142,9 @@ def beside(cars: Agents, to_left: jax.Array, road_map: RoadMap, key: jax.Array) 
     new_spacing = road_map.lane_length[new_lane] / (road_map.lane_num_points[new_lane] - 1)
     s = (there - road_map.lane_start[new_lane]) * new_spacing + offset[:, 0]
     lanes = plan(new_lane, cars.model, road_map, key)
-    free = cars.valid & ~cars.is_lawless & ~cars.is_braking_hard & (cars.from_lane < 0)
+    # Whoever has a part in a scenario keeps its lane.
+    plays = cars.is_lawless | cars.is_braking_hard | (cars.cruise_speed > 0.0)
+    free = cars.valid & ~plays & (cars.from_lane < 0)
     room = jnp.maximum(ROOM, ROOM_TIME * cars.speed)
     here = _has_room(cars.lanes, cars.lane_s, room, road_map)
     return Change(
@@ -179,42 +197,52 @@ def judge(
       too hard for it.
     """
     cars = jax.tree.map(lambda x: x[rows], agents)
-    seen = with_leaving(movers, agents)
+    others = _others(agents, movers, desired, road_map, params)
     length = cars.length
-    old = gaps(cars.lanes, cars.lane_s, length, rows, seen, road_map)
-    new = gaps(change.lanes, change.s, length, rows, seen, road_map)
-    limit = road_map.lane_speed_limit[jnp.maximum(change.lanes[:, 0], 0)]
-    old_limit = road_map.lane_speed_limit[planned_lane(cars, 0)]
+    old = gaps(cars.lanes, cars.lane_s, length, rows, others, road_map)
+    new = gaps(change.lanes, change.s, length, rows, others, road_map)
     own = vehicles.driver(cars.model, params)
-    stays = idm.acceleration(cars.speed, old.ahead, old.leader_speed, desired[rows], own)
-    there = desired[rows] * limit / old_limit
-    goes = idm.acceleration(cars.speed, new.ahead, new.leader_speed, there, own)
+    faster = road_map.lane_speed_limit[jnp.maximum(change.lanes[:, 0], 0)]
+    faster = faster / road_map.lane_speed_limit[planned_lane(cars, 0)]
+    free = desired[rows]
+    stays = idm.acceleration(cars.speed, old.ahead, old.leader_speed, free, own)
+    goes = idm.acceleration(cars.speed, new.ahead, new.leader_speed, free * faster, own)
 
-    # The ego, and a car that is leaving its lane, count as cars that drive at the limit or faster.
-    num = agents.lane_s.shape[0]
-
-    def follower_accel(side: Gaps, gap: jax.Array, leader_speed: jax.Array) -> jax.Array:
-        is_agent, row = side.follower < num, jnp.minimum(side.follower, num - 1)
-        model = jnp.where(is_agent, agents.model[row], vehicles.CAR)
-        free = jnp.maximum(side.follower_speed, limit)
-        free = jnp.where(is_agent, desired[row], free)
-        driver = vehicles.driver(model, params)
-        return idm.acceleration(side.follower_speed, gap, leader_speed, free, driver)
+    def follower(side: Gaps, gap: jax.Array, leader_speed: jax.Array) -> jax.Array:
+        return idm.acceleration(
+            side.follower_speed, gap, leader_speed, side.follower_desired, side.follower
+        )
 
     whole = new.behind + length + new.ahead
-    behind_now = follower_accel(new, whole, new.leader_speed)
-    behind_then = follower_accel(new, new.behind, cars.speed)
-    left_now = follower_accel(old, old.behind, cars.speed)
-    left_then = follower_accel(old, old.behind + length + old.ahead, old.leader_speed)
-    others = jnp.where(new.behind < FAR, behind_then - behind_now, 0.0)
-    others += jnp.where(old.behind < FAR, left_then - left_now, 0.0)
+    behind_now = follower(new, whole, new.leader_speed)
+    behind_then = follower(new, new.behind, cars.speed)
+    left_now = follower(old, old.behind, cars.speed)
+    left_then = follower(old, old.behind + length + old.ahead, old.leader_speed)
+    gain = jnp.where(new.behind < FAR, behind_then - behind_now, 0.0)
+    gain += jnp.where(old.behind < FAR, left_then - left_now, 0.0)
+    gain = goes - stays + POLITENESS * gain
     must = _ends(cars.lanes, cars.lane_s, road_map)
     bound = -jnp.where(must, SAFE_BRAKING, POLITE_BRAKING)
     safe = (new.ahead > MIN_GAP) & (new.behind > MIN_GAP) & (goes > bound)
     # Nobody stands so near ahead that there is no way around.
     safe &= old.ahead + ROOM_TIME * old.leader_speed > PULL_OUT
     safe &= (behind_then > bound) | (new.behind >= FAR)
-    return goes - stays + POLITENESS * others, safe
+    return gain, safe
+
+
+def _others(
+    agents: Agents, movers: Mover, desired: jax.Array, road_map: RoadMap, params: IDMParams
+) -> Others:
+    """Everybody, with how they drive; the ego counts as a car that drives at the limit at least."""
+    row, _ = changing(agents)
+    ego_limit = road_map.lane_speed_limit[jnp.maximum(movers.lane[-1], 0)]
+    ego_desired = jnp.maximum(ego_limit, movers.speed[-1])
+    model = jnp.append(agents.model, vehicles.CAR)
+    return Others(
+        mover=with_leaving(movers, agents),
+        desired=jnp.concatenate([desired, ego_desired[None], desired[row]]),
+        driver=vehicles.driver(jnp.concatenate([model, agents.model[row]]), params),
+    )
 
 
 def gaps(
@@ -222,7 +250,7 @@ def gaps(
     s: jax.Array,
     length: jax.Array,
     itself: jax.Array,
-    movers: Mover,
+    others: Others,
     road_map: RoadMap,
 ) -> Gaps:
     """Whom a place on a lane has before and behind it; those exactly beside count as behind.
@@ -231,10 +259,11 @@ def gaps(
       lanes: (M, 3) int32, the lane and the two after it.
       s: (M,) m on the first.
       length: (M,) m, of the vehicle that is or would be there.
-      itself: (M,) int32, row of that vehicle among the movers.
-      movers: (N,) everybody.
+      itself: (M,) int32, row of that vehicle among the others.
+      others: everybody.
       road_map: the map.
     """
+    movers = others.mover
     is_other = jnp.arange(movers.lane.shape[0]) != itself[:, None]
     lane, other_s = jnp.where(is_other, movers.lane[None, :], -1), movers.s[None, :]
     to_next = (road_map.lane_length[jnp.maximum(lanes[:, 0], 0)] - s)[:, None]
@@ -252,16 +281,21 @@ def gaps(
     behind = jnp.where(on_first & (offset <= 0.0), -offset, jnp.where(arrives, until, FAR))
     half = 0.5 * length[:, None] + movers.half_length[None, :]
     ahead, behind = ahead - half, behind - half
-    first, last = jnp.argmin(ahead, axis=1), jnp.argmin(behind, axis=1)
+    nearest, follows = ahead.min(axis=1), behind.min(axis=1)
 
-    def at(values: jax.Array, row: jax.Array) -> jax.Array:
-        return jnp.take_along_axis(values, row[:, None], axis=1)[:, 0]
+    # Of whoever is nearest: no search by index, which costs more than all the rest.
+    def of(is_it: jax.Array, values: jax.Array) -> jax.Array:
+        return jnp.where(is_it, values, 0.0).max(axis=1)
 
-    nearest, follows = at(ahead, first), at(behind, last)
+    leads, comes = ahead == nearest[:, None], behind == follows[:, None]
     return Gaps(
         ahead=jnp.where(nearest < 0.5 * FAR, nearest, FAR),
         behind=jnp.where(follows < 0.5 * FAR, follows, FAR),
-        leader_speed=movers.speed[first],
-        follower_speed=movers.speed[last],
-        follower=last,
+        leader_speed=of(leads, movers.speed),
+        follower_speed=of(comes, movers.speed),
+        follower_desired=of(comes, others.desired),
+        follower=others.driver.replace(
+            accel_max=of(comes, others.driver.accel_max),
+            comfort_brake=of(comes, others.driver.comfort_brake),
+        ),
     )

@@ -100,10 +100,10 @@ def leaders(agents: Agents, movers: Mover, road_map: RoadMap) -> tuple[jax.Array
     offset = seen.s - left_s[:, None]
     gap = jnp.where((seen.lane == left[:, None]) & (offset > 0.0), offset, FAR)
     gap = gap - half[row][:, None] - seen.half_length
-    first = jnp.argmin(gap, axis=1)
-    nearest = jnp.take_along_axis(gap, first[:, None], axis=1)[:, 0]
+    nearest = gap.min(axis=1)
+    speed = jnp.where(gap == nearest[:, None], seen.speed, 0.0).max(axis=1)
     is_mine = (jnp.arange(agents.lane_s.shape[0])[:, None] == row) & is_used  # (N, AT_ONCE)
     both = jnp.concatenate([ahead, jnp.where(is_mine, nearest, FAR)], axis=1)
-    speeds = jnp.concatenate([agents.speed[row], seen.speed[first]])
-    chosen = jnp.argmin(both, axis=1)
-    return jnp.take_along_axis(both, chosen[:, None], axis=1)[:, 0], speeds[chosen]
+    speeds = jnp.concatenate([agents.speed[row], speed])
+    least = both.min(axis=1)
+    return least, jnp.where(both == least[:, None], speeds, 0.0).max(axis=1)

@@ -159,9 +159,10 @@ def leaders(agents: Agents, movers: Mover, road_map: RoadMap) -> tuple[jax.Array
     gap = jnp.minimum(gap, jnp.where(on_next, to_next + other_s, FAR))
     gap = jnp.minimum(gap, jnp.where(other == lanes[:, 2], to_third + other_s, FAR))
     gap = jnp.where((other >= 0) & (gap > 0.0), gap - movers.half_length[None, :], FAR)
-    first = jnp.argmin(gap, axis=1)
-    nearest = jnp.take_along_axis(gap, first[:, None], axis=1)[:, 0]
-    return nearest - 0.5 * agents.length, movers.speed[first]
+    nearest = gap.min(axis=1)
+    # No search by index, which would cost more than all of the above.
+    speed = jnp.where(gap == nearest[:, None], movers.speed, 0.0).max(axis=1)
+    return nearest - 0.5 * agents.length, speed
 
 
 def corridor_gap(agents: Agents, ego: EgoState, ego_length: jax.Array) -> jax.Array:
