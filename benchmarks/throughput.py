@@ -21,7 +21,7 @@ import jax.numpy as jnp
 import tyro
 from jax.sharding import PartitionSpec
 
-from carljax import build, drive, machine, presets
+from carljax import build, machine, presets
 from carljax.config import TrainConfig
 from carljax.ppo import trainer
 from carljax.ppo.config import PPOConfig
@@ -114,7 +114,12 @@ def render(
     """Observations one after the other, as in a rollout; only the ego turns a little."""
     env = small_env(command, config, towns, RENDER_AGENTS, raster)
     episodes = jnp.arange(RENDER_ENVS) % env.bank.num_episodes
-    state = jax.jit(drive.start)(env, episodes, jax.random.key(0)).state
+
+    def first(env: DrivingEnv, episode: jax.Array) -> State:
+        key = jax.random.fold_in(jax.random.key(0), episode)
+        return env.observe(env.start_episode(episode, key))
+
+    state = jax.jit(jax.vmap(first, in_axes=(None, 0)))(env, episodes)
 
     def turn(state: State) -> State:
         sim = state.pipeline_state

@@ -1,8 +1,8 @@
-"""`python -m carljax.evaluate --checkpoint DIR`: the Driving Score on held-out routes.
+"""`python -m carljax.evaluate`: the Driving Score of a policy or of a rule-based planner.
 
 All routes are driven at once by one compiled loop that ends with the last of them. Actions are the
-mean of the policy; routes and the key of the traffic are fixed, so the same checkpoint gives the
-same score.
+mean of the policy; routes and the key of the traffic are fixed, so the same driver gets the same
+score. A repetition has another key of its own.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import sys
+import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
@@ -20,114 +21,161 @@ import numpy as np
 import tyro
 from rich.console import Console
 
-from carljax import atomic, build, checkpoint, drive, machine, run_dir, scores
+from carljax import atomic, build, checkpoint, courses, drive, machine, result_file, run_dir
+from carljax import score_table as table
 from carljax.checkpoint import CheckpointError
-from carljax.config import HELD_OUT_SEED, ConfigError, TrainConfig
-from carljax.leaderboard import INFRACTIONS, Drive
+from carljax.config import ConfigError, TrainConfig
+from carljax.courses import Course
+from carljax.drive import NetworkPolicy, PlannerPolicy, Policy, Run
+from carljax.leaderboard import EVENTS, Drive
+from carljax.planners import PLANNERS
 from carljax.ppo.networks import ActorCritic
 from carljax.render import gif
-from carljax.scores import EvalResult, RouteScore
+from carljax.route_bank import BankError
+from carljax.scores import EvalResult, Event, RouteScore
 from carljax.sim.env import DrivingEnv
+from carljax.sim.leaderboard_files import RouteFileError
 from carljax.sim.road_network import MapError
 from carljax.sim.route_generator import RouteError
-from carljax.sim.town import Town
 
 FILE = "evaluation.json"
 TRAFFIC_SEED = 0
+USER_ERRORS = (ConfigError, CheckpointError, MapError, RouteError, RouteFileError, BankError)
+HELD_OUT_ROUTES = 64  # where --map alone is given
 
 
-def held_out(config: TrainConfig, towns: Sequence[Town], num_routes: int) -> DrivingEnv:
-    """Makes the environment with the routes that are kept for scoring, always the same ones."""
-    return build.environment(config, towns, num_routes, HELD_OUT_SEED)
-
-
-def evaluate(
-    env: DrivingEnv, network: ActorCritic, params: Any, town_names: Sequence[str] = ()
-) -> EvalResult:
-    """Drives every route of an environment's bank once and scores it.
+def evaluate(course: Course, policy: Policy, repetitions: int = 1) -> EvalResult:
+    """Drives every route of a course and scores it.
 
     Args:
-      env: with the routes to drive.
-      network: actor and critic.
-      params: its variables.
-      town_names: of the bank's towns, for the result; numbers by default.
+      course: the routes.
+      policy: who drives.
+      repetitions: how often, each time with other lights and other choices of the traffic.
 
     Returns:
       The scores.
     """
-    drive_all = drive.compiled(_drive_all, network)
-    ended: Drive = jax.device_get(drive_all(env, jax.device_get(params)))
-    metrics, counts = ended.state.metrics, ended.counts
-    towns = np.asarray(env.bank.routes.town)
-    names = town_names or [str(number) for number in range(towns.max() + 1)]
-    lengths = np.asarray(env.bank.routes.length)
-    return EvalResult(
-        tuple(
-            RouteScore(
-                route=i,
-                town=names[towns[i]],
-                length_km=float(lengths[i]) / 1000.0,
-                driven_km=float(metrics["episode/km"][i]),
-                seconds=float(metrics["episode/length"][i]) * env.config.dt,
-                completion=float(metrics["episode/route_completion"][i]),
-                clean_completion=float(ended.clean_completion[i]),
-                outside_frac=_fraction(
-                    metrics["episode/outside_lanes_km"][i], metrics["episode/km"][i]
-                ),
-                infractions=tuple(
-                    name for name in INFRACTIONS for _ in range(int(counts[name][i]))
-                ),
-            )
-            for i in range(len(lengths))
-        )
+    drive_all = drive.compiled(_drive_all)
+    routes: list[RouteScore] = []
+    for repetition in range(repetitions):
+        key = jax.random.key(TRAFFIC_SEED + repetition)
+        ended: Drive = jax.device_get(drive_all(policy, course.env, key))
+        routes += [
+            _score(course, jax.tree.map(lambda x, i=i: x[i], ended), i, repetition)
+            for i in range(len(course.route_ids))
+        ]
+    return EvalResult(tuple(routes))
+
+
+def _drive_all(policy: Policy, env: DrivingEnv, key: jax.Array) -> Drive:
+    """Drives until all routes have ended; (B,) drives as they ended, without key and images."""
+
+    def is_any_running(run: Run) -> jax.Array:
+        return jnp.any(run.drive.state.done == 0)
+
+    def again(run: Run) -> Run:
+        return drive.step(policy, env, run)[0]
+
+    run = drive.start(policy, env, jnp.arange(env.bank.num_episodes), key)
+    ended = jax.lax.while_loop(is_any_running, again, run).drive
+    sim = ended.state.pipeline_state.replace(key=None)
+    return ended.replace(state=ended.state.replace(pipeline_state=sim, obs=None))
+
+
+def _score(course: Course, ended: Drive, index: int, repetition: int) -> RouteScore:
+    """The score of one drive, on the host."""
+    town = course.towns[course.town_of_route[index]]
+    num_stages = int(ended.min_speed.num_stages)
+    return RouteScore(
+        index=index,
+        route_id=course.route_ids[index],
+        repetition=repetition,
+        town=town.network.name,
+        length_km=float(course.env.bank.routes.length[index]) / 1000.0,
+        driven_km=float(ended.driven_m) / 1000.0,
+        seconds=int(ended.state.pipeline_state.step_count) * course.env.config.dt,
+        completion=float(ended.completion),
+        clean_completion=float(ended.clean_completion),
+        outside_km=float(ended.outside_m) / 1000.0,
+        num_scenarios=int(course.num_scenarios[index]),
+        num_triggered=int(ended.state.pipeline_state.scenarios.num_triggered),
+        speed_percent=tuple(ended.min_speed.percent[:num_stages].tolist()),
+        events=_events(ended, town.offset, course.env.config.dt),
     )
 
 
-def _drive_all(network: ActorCritic, env: DrivingEnv, params: Any) -> Drive:
-    """Drives until all routes have ended; (B,) drives as they ended, without key and images."""
+def _events(ended: Drive, offset: np.ndarray, dt: float) -> tuple[Event, ...]:
+    """The log in words; what it had no room for follows without a place."""
+    log = ended.log
+    filled = min(int(log.num), len(log.kind))
+    seconds = int(ended.state.pipeline_state.step_count) * dt
+    events = [
+        Event(
+            name=EVENTS[kind],
+            xyz=(float(xyz[0] + offset[0]), float(xyz[1] + offset[1]), float(xyz[2])),
+            seconds=int(step) * dt,
+            agent=int(agent) if agent >= 0 else None,
+        )
+        for kind, xyz, step, agent in zip(
+            log.kind[:filled], log.xyz, log.step, log.agent, strict=False
+        )
+    ]
+    names = [event.name for event in events]
+    for name in EVENTS:
+        missing = int(ended.counts[name]) - names.count(name)
+        events += [Event(name, None, seconds)] * missing
+    return tuple(events)
 
-    def is_any_running(run: Drive) -> jax.Array:
-        return jnp.any(run.state.done == 0)
 
-    def again(run: Drive) -> Drive:
-        return drive.step(network, env, params, run)[0]
+def save(result: EvalResult, path: Path, system_seconds: float, **context: Any) -> None:
+    """Writes the scores as JSON, whole or not at all, with what they were measured on.
 
-    episodes = jnp.arange(env.bank.num_episodes)
-    run = drive.start(env, episodes, jax.random.key(TRAFFIC_SEED))
-    run = jax.lax.while_loop(is_any_running, again, run)
-    return run.replace(state=run.state.replace(pipeline_state=None, obs=None))
-
-
-def _fraction(part: Any, whole: Any) -> float:
-    return float(part / whole) if whole > 0 else 0.0
-
-
-def save(result: EvalResult, path: Path, **context: Any) -> None:
-    """Writes the scores as JSON, whole or not at all, with what they were measured on."""
-    values = {**context, **result.to_json(), "machine": machine.describe()}
+    Args:
+      result: the scores.
+      path: the file.
+      system_seconds: wall time of the evaluation.
+      context: what else is to be known, in values that JSON can hold.
+    """
+    values = {
+        **result_file.layout(result, system_seconds),
+        "carljax": {**context, **result.to_json(), "machine": machine.describe()},
+    }
     atomic.write_text(path, json.dumps(values, indent=2) + "\n")
 
 
 @dataclasses.dataclass(frozen=True)
 class Command:
-    """Which policy to score, on what, and what to write."""
+    """Who drives, on what, and what to write."""
 
-    checkpoint: Annotated[Path, tyro.conf.arg(metavar="DIR")]
-    """Run directory, or one checkpoint in it: RUN/checkpoints/UPDATE."""
-    num_routes: int = 64
-    """Held-out routes to drive, the same ones every time, over all towns."""
+    checkpoint: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
+    """Score this policy: a run directory, or one checkpoint in it, RUN/checkpoints/UPDATE."""
+    best: bool = False
+    """Take the checkpoint with the best mean return instead of the newest."""
+    untrained: bool = False
+    """Take a newly initialised network of the same kind instead, for comparison."""
+    planner: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
+    """Score this rule-based planner instead of a checkpoint."""
+    routes: Annotated[Path | None, tyro.conf.arg(metavar="FILE.xml|BANK.npz")] = None
+    """Drive the routes of this leaderboard file or bank instead of the carljax-36 benchmark."""
+    map_folder: Annotated[Path | None, tyro.conf.arg(name="maps", metavar="DIR")] = None
+    """Folder with TOWN.xodr for every town of a route file."""
+    triggers: Annotated[Path | None, tyro.conf.arg(metavar="FILE.json")] = None
+    """Leaderboard 1.0's scenarios, for a route file that has none."""
+    yaws: Annotated[Path | None, tyro.conf.arg(metavar="FILE.xml")] = None
+    """A route file's routes in version 1, which has the waypoints' yaw."""
+    num_routes: int | None = None
+    """Drive so many held-out routes in the policy's own world instead, over all towns."""
     maps: Annotated[
         tuple[Path, ...],
         tyro.conf.UseAppendAction,
         tyro.conf.arg(name="map", metavar="FILE.xodr"),
     ] = ()
-    """OpenDRIVE file to be scored in; repeatable. None: where the policy was trained."""
-    best: bool = False
-    """Score the checkpoint with the best mean return instead of the newest."""
-    untrained: bool = False
-    """Score a newly initialised network of the same kind instead, for comparison."""
+    """OpenDRIVE file of a bank, or of held-out routes (repeatable; by default the bundled towns, or
+    those of the policy's training)."""
+    repetitions: int = 1
+    """Drive every route so many times, each time in other traffic."""
     json: Annotated[Path | None, tyro.conf.arg(metavar="OUT.json")] = None
-    """Write all scores here."""
+    """Write all scores here, in the layout of CARLA's leaderboard."""
     gif: Annotated[Path | None, tyro.conf.arg(metavar="OUT.gif")] = None
     """Draw one route here."""
     gif_route: int = 0
@@ -152,7 +200,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     )
     try:
         return run(command, Console())
-    except (ConfigError, CheckpointError, MapError, RouteError) as error:
+    except USER_ERRORS as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
 
@@ -167,44 +215,106 @@ def run(command: Command, console: Console) -> int:
     Returns:
       Exit status.
     """
-    if command.num_routes < 1 or not 0 <= command.gif_route < command.num_routes:
+    _check(command)
+    config = _config(command)
+    course = _course(command, config)
+    if command.gif is not None and not 0 <= command.gif_route < len(course.route_ids):
         raise ConfigError(
-            f"--gif-route {command.gif_route}: is not among --num-routes {command.num_routes}"
+            f"--gif-route {command.gif_route}: there are {len(course.route_ids)} routes"
         )
-    path, update = run_dir.split_checkpoint(command.checkpoint)
-    config = run_dir.load_config(path)
-    towns = build.load_towns(command.maps or config.run.maps)
-    env = held_out(config, towns, command.num_routes)
-    network = ActorCritic(config.network)
-    params, update = _load_params(command, path, update, config, env)
-    result = evaluate(env, network, params, [town.network.name for town in towns])
-    scores.show(result, console)
+    policy, who = _policy(command, config, course.env)
+    since = time.perf_counter()
+    result = evaluate(course, policy, command.repetitions)
+    seconds = time.perf_counter() - since
+    table.show(result, console, title=f"{course.title}, {who['policy']}")
     if command.json is not None:
-        policy = "untrained" if command.untrained else str(path)
-        save(result, command.json, policy=policy, update=update)
+        save(result, command.json, seconds, **who, course=course.title)
         console.print(f"scores: {command.json}")
     if command.gif is not None:
-        gif.save(command.gif, env, network, params, command.gif_route)
+        gif.save(command.gif, course.env, policy, command.gif_route)
         console.print(f"drawn: {command.gif}")
     return 0
 
 
-def _load_params(
-    command: Command, path: Path, update: int | None, config: TrainConfig, env: DrivingEnv
-) -> tuple[Any, int | None]:
-    """The parameters to score and the update that they are of; None for new ones."""
+def _check(command: Command) -> None:
+    """Refuses arguments that do not go together."""
+    if (command.checkpoint is None) == (command.planner is None):
+        raise ConfigError("give one of --checkpoint DIR and --planner NAME")
+    if command.planner is not None:
+        if command.planner not in PLANNERS:
+            raise ConfigError(
+                f"--planner {command.planner}: there is no such planner; there are:"
+                f" {', '.join(PLANNERS)}"
+            )
+        if command.best or command.untrained:
+            raise ConfigError("--best and --untrained go with --checkpoint, not with --planner")
+    for name, value in (("num-routes", command.num_routes), ("repetitions", command.repetitions)):
+        if value is not None and value < 1:
+            raise ConfigError(f"--{name} {value}: is below the least allowed, 1")
+    _check_routes(command)
+
+
+def _check_routes(command: Command) -> None:
+    """Refuses arguments about routes that are not for the kind of routes given."""
+    path = command.routes
+    kind = None if path is None else path.suffix
+    if kind not in (None, ".xml", ".npz"):
+        raise ConfigError(f"--routes {path}: is neither a route file .xml nor a bank .npz")
+    if (kind == ".xml") != (command.map_folder is not None):
+        raise ConfigError("--routes FILE.xml and --maps DIR go together")
+    if kind != ".xml" and (command.triggers or command.yaws):
+        raise ConfigError("--triggers and --yaws go with --routes FILE.xml")
+    if path is not None and command.num_routes is not None:
+        raise ConfigError("give one of --routes and --num-routes")
+    if (kind == ".xml" and command.maps) or (kind == ".npz" and len(command.maps) > 1):
+        raise ConfigError("--map is for held-out routes, or once for a bank; a file has --maps DIR")
+
+
+def _course(command: Command, config: TrainConfig) -> Course:
+    """What is driven."""
+    path = command.routes
+    if path is not None and command.map_folder is not None:
+        folder, triggers, yaws = command.map_folder, command.triggers, command.yaws
+        return courses.of_route_file(config, path, folder, triggers, yaws)
+    if path is not None:
+        return courses.of_bank(config, path, command.maps[0] if command.maps else None)
+    if command.num_routes is None and not command.maps:
+        return courses.carljax_36(config)
+    towns = build.load_towns(command.maps or config.run.maps)
+    return courses.held_out(config, towns, command.num_routes or HELD_OUT_ROUTES)
+
+
+def _config(command: Command) -> TrainConfig:
+    """The configuration of the policy; a planner takes the world as it is by default."""
+    if command.checkpoint is None:
+        return TrainConfig()
+    return run_dir.load_config(run_dir.split_checkpoint(command.checkpoint)[0])
+
+
+def _policy(
+    command: Command, config: TrainConfig, env: DrivingEnv
+) -> tuple[Policy, dict[str, Any]]:
+    """Who drives, and how to write that down."""
+    if command.checkpoint is None:
+        name = str(command.planner)
+        return PlannerPolicy(PLANNERS[name]), {"policy": name, "update": None}
+    path, update = run_dir.split_checkpoint(command.checkpoint)
     network = ActorCritic(config.network)
 
     def initialise(env: DrivingEnv) -> Any:
-        first = drive.start(env, jnp.arange(1), jax.random.key(TRAFFIC_SEED))
-        return network.init(jax.random.key(config.run.seed), first.state.obs)
+        first = env.reset(jax.random.key(TRAFFIC_SEED))
+        batch = jax.tree.map(lambda x: x[None], first.obs)
+        return network.init(jax.random.key(config.run.seed), batch)
 
     if command.untrained:
-        return jax.jit(initialise)(env), None
+        return NetworkPolicy(jax.jit(initialise)(env), network), {
+            "policy": "untrained",
+            "update": None,
+        }
     chosen = checkpoint.best(path) if command.best else update
-    like = jax.eval_shape(initialise, env)
     chosen = chosen if chosen is not None else max(checkpoint.updates(path), default=None)
-    return checkpoint.restore_params(path, like, chosen), chosen
+    params = checkpoint.restore_params(path, jax.eval_shape(initialise, env), chosen)
+    return NetworkPolicy(params, network), {"policy": str(path), "update": chosen}
 
 
 if __name__ == "__main__":

@@ -1,10 +1,9 @@
-"""An evaluated drive: it goes on after a collision, a red light or a stop sign.
+"""An evaluated drive: what counts against the car, what ends its route, by CARLA leaderboard 2.0.
 
-Training ends at every hard infraction; CARLA's leaderboard counts most of them and lets the car
-drive on, so that a route's completion and its infractions are two figures. After a collision the
-ego stands where it was stopped and whom it struck is taken away: the same contact counts once.
-Source: CARLA leaderboard 2.0. Ours: leaving the road ends the route, where the leaderboard has the
-car meet a wall or lose its route; and a struck car is gone at once.
+Training ends at every hard infraction; the leaderboard counts most of them and lets the car drive
+on, so that a route's completion and its infractions are two figures. Its limits hold whatever the
+policy was trained with (`RULES`). Ours: leaving the road ends the route, where CARLA has walls and
+kerbs; and what follows a collision (`aftermath`). `scores` makes a score of a drive.
 """
 
 from __future__ import annotations
@@ -13,9 +12,15 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from carljax.reward import collision
+from carljax import aftermath, event_log, min_speed
+from carljax.aftermath import Aftermath
+from carljax.event_log import EventLog
+from carljax.min_speed import MinSpeed
+from carljax.reward import blocked, collision
+from carljax.reward.config import RewardConfig
+from carljax.sim import population
 from carljax.sim.env import DrivingEnv
-from carljax.sim.types import KIND_NONE, KIND_PEDESTRIAN, KIND_STATIC, KIND_VEHICLE, State
+from carljax.sim.types import KIND_PEDESTRIAN, KIND_STATIC, KIND_VEHICLE, SimState, State
 
 COLLISIONS = {
     "pedestrian_collision": KIND_PEDESTRIAN,
@@ -23,10 +28,23 @@ COLLISIONS = {
     "static_collision": KIND_STATIC,
 }
 GOES_ON = ("red_light", "stop_sign")
+OF_SCENARIOS = ("scenario_timeout", "failed_to_yield")
 ENDS = ("off_road", "route_deviation", "blocked", "timeout")
-INFRACTIONS = (*COLLISIONS, *GOES_ON, *ENDS)
-# m/s, below which the ego is not to blame for being struck. source: CARLA leaderboard 2.0
-BLAME_SPEED = 0.1
+# What happens at a moment. Speed and lanes are measured over the route instead.
+EVENTS = (*COLLISIONS, *GOES_ON, *OF_SCENARIOS, *ENDS)
+# What ends an episode of training.
+HARD = (*COLLISIONS, *GOES_ON, *ENDS)
+
+# Numbers of the rules: where the ego is off its lanes, runs a light, has lost its route. The
+# defaults are the leaderboard's; a policy may have been trained with others.
+RULES = RewardConfig()
+BLOCKED_S = 180.0  # s. source: CARLA leaderboard 2.0
+BLOCKED_SPEED = 0.1  # m/s. source: CARLA leaderboard 2.0
+# The route's time: so much, and for every metre that at this fraction of the speed limit.
+# source: CARLA leaderboard 2.0
+TIME_S, TIME_SPEED_FRAC = 300.0, 0.1
+# A route is finished past this completion and this near its goal. source: CARLA leaderboard 2.0
+GOAL_PERCENT, GOAL_DISTANCE = 99.0, 10.0
 
 
 class Drive(struct.PyTreeNode):
@@ -34,89 +52,170 @@ class Drive(struct.PyTreeNode):
 
     Attributes:
       state: of the environment; `done` marks the end of the route, however it ended.
-      counts: {name of INFRACTIONS: () int32}.
-      clean_completion: () percent of the route at the first infraction, the present one before it.
+      aftermath: of collisions.
+      min_speed: the ego's speed against the traffic's.
+      log: the events with their places; kinds are places in `EVENTS`.
+      counts: {name of EVENTS: () int32}.
+      completion: () percent of the route, 100 once it is finished.
+      clean_completion: () percent of the route at the first infraction of `HARD`, the present one
+        before it.
+      driven_m: () m, driven by the ego.
+      outside_m: () m of the route that it passed outside lanes.
+      stopped_s: () s it has stood without a break.
+      time_limit_s: () s, the route's time so far.
     """
 
     state: State
+    aftermath: Aftermath
+    min_speed: MinSpeed
+    log: EventLog
     counts: dict[str, jax.Array]
+    completion: jax.Array
     clean_completion: jax.Array
+    driven_m: jax.Array
+    outside_m: jax.Array
+    stopped_s: jax.Array
+    time_limit_s: jax.Array
 
 
 def begin(state: State) -> Drive:
     """A drive from its first state."""
-    counts = {name: jnp.zeros((), jnp.int32) for name in INFRACTIONS}
-    return Drive(state=state, counts=counts, clean_completion=jnp.zeros((), jnp.float32))
+    zero = jnp.zeros((), jnp.float32)
+    return Drive(
+        state=state,
+        aftermath=aftermath.nothing(state.pipeline_state.agents.kind.shape[0]),
+        min_speed=min_speed.start(),
+        log=event_log.empty(),
+        counts={name: jnp.zeros((), jnp.int32) for name in EVENTS},
+        completion=zero,
+        clean_completion=zero,
+        driven_m=zero,
+        outside_m=zero,
+        stopped_s=zero,
+        time_limit_s=jnp.full((), TIME_S, jnp.float32),
+    )
 
 
 def advance(env: DrivingEnv, drive: Drive, action: jax.Array) -> Drive:
     """Makes one step, without an observation; a drive that has ended stays as it ended.
 
     Args:
-      env: the environment.
+      env: the environment; its reward's numbers do not matter.
       drive: before.
       action: (2,) float32 in [-1, 1].
 
     Returns:
       The drive after.
     """
-    before = drive.state
-    moved = env.advance(before, action)
-    struck = struck_agents(env, moved)
-    counts = {
-        name: drive.counts[name] + happened.astype(jnp.int32)
-        for name, happened in infractions(before, moved, struck).items()
-    }
-    was_clean = sum(drive.counts.values()) == 0
-    completion = moved.metrics["episode/route_completion"]
-    after = Drive(
-        state=go_on(moved, struck),
-        counts=counts,
-        clean_completion=jnp.where(was_clean, completion, drive.clean_completion),
+    before, dt = drive.state, env.config.dt
+    env = env.replace(reward_config=RULES)
+    moved = env.advance(before, aftermath.possible_action(drive.aftermath, action))
+    remains, moved, struck = _collide(env, drive, moved)
+    sim = moved.pipeline_state
+    old_s, route_s, limit = _progress(env, before.pipeline_state, sim)
+    after = drive.replace(
+        state=moved,
+        aftermath=remains,
+        driven_m=drive.driven_m + 0.5 * (before.pipeline_state.ego.speed + sim.ego.speed) * dt,
+        outside_m=drive.outside_m
+        + jnp.where(moved.metrics["reward/outside_lanes"] < 1.0, route_s - old_s, 0.0),
+        stopped_s=blocked.standing_time(drive.stopped_s, sim.ego.speed, BLOCKED_SPEED, dt),
+        time_limit_s=drive.time_limit_s + (route_s - old_s) / (TIME_SPEED_FRAC * limit),
+        min_speed=_measure_speed(env, drive.min_speed, sim, route_s),
     )
+    after = _conclude(env, after, route_s, struck)
     return jax.tree.map(lambda old, new: jnp.where(before.done > 0, old, new), drive, after)
 
 
-def struck_agents(env: DrivingEnv, state: State) -> jax.Array:
-    """(N,) bool, whom the ego touches."""
-    sim = state.pipeline_state
-    return collision.touched(sim.ego, sim.agents, env.vehicle, env.reward_config.z_gap)
+def _collide(env: DrivingEnv, drive: Drive, moved: State) -> tuple[Aftermath, State, jax.Array]:
+    """The aftermath, the state with all who are struck halted, and whose collision is charged."""
+    before, sim = drive.state.pipeline_state, moved.pipeline_state
+    remains, agents = aftermath.settle(drive.aftermath, before.agents, sim.agents, env.config.dt)
+    touched = collision.touched(sim.ego, agents, env.vehicle, RULES.z_gap)
+    moved = moved.replace(pipeline_state=sim.replace(agents=agents))
+    return aftermath.strike(remains, before.ego.speed, moved, touched)
 
 
-def infractions(before: State, moved: State, struck: jax.Array) -> dict[str, jax.Array]:
-    """What happened in one step, {name of INFRACTIONS: () bool}.
+def _progress(
+    env: DrivingEnv, before: SimState, after: SimState
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Progress on the route before and after a step, m, and the speed limit there, m/s."""
+    routes, episode = env.bank.routes, after.episode_idx
+    limit = routes.speed_limit[episode, after.route_idx]
+    return routes.s[episode, before.route_idx], routes.s[episode, after.route_idx], limit
+
+
+def _measure_speed(
+    env: DrivingEnv, measured: MinSpeed, sim: SimState, route_s: jax.Array
+) -> MinSpeed:
+    traffic = population.rows(sim.agents, env.config.population.traffic)
+    length = env.bank.routes.length[sim.episode_idx]
+    return min_speed.update(measured, sim.ego, traffic, route_s, length)
+
+
+def _conclude(env: DrivingEnv, drive: Drive, route_s: jax.Array, struck: jax.Array) -> Drive:
+    """Notes what happened in a step and whether the route has ended with it.
 
     Args:
-      before: the state before the step.
-      moved: the state after it.
-      struck: (N,) bool, see `struck_agents`.
-    """
-    kind = moved.pipeline_state.agents.kind
-    to_blame = before.pipeline_state.ego.speed >= BLAME_SPEED
-    hits = {name: jnp.any(struck & (kind == of)) & to_blame for name, of in COLLISIONS.items()}
-    rest = {name: moved.metrics[f"reward/{name}"] > 0 for name in (*GOES_ON, *ENDS)}
-    return {**hits, **rest}
-
-
-def go_on(moved: State, struck: jax.Array) -> State:
-    """Halts the ego at a collision and takes the struck away; only `ENDS` and the goal end a route.
-
-    Args:
-      moved: the state after a step.
-      struck: (N,) bool, see `struck_agents`.
+      env: the environment.
+      drive: after the step.
+      route_s: () m, progress on the route.
+      struck: () int32, row of the agent whose collision is charged, -1 for none.
 
     Returns:
-      The state to drive on from.
+      The drive with its counts, its log and its end.
     """
-    ended = moved.metrics["reward/finished"] > 0
+    state, sim = drive.state, drive.state.pipeline_state
+    length = env.bank.routes.length[sim.episode_idx]
+    completion = 100.0 * route_s / length
+    finished = (completion > GOAL_PERCENT) & (_goal_distance(env, sim) < GOAL_DISTANCE)
+    happened = infractions(drive, struck, env.config.dt)
+    ended = finished
     for name in ENDS:
-        ended |= moved.metrics[f"reward/{name}"] > 0
-    sim = moved.pipeline_state
-    hit = jnp.any(struck)
-    halted = sim.ego.replace(
-        speed=jnp.where(hit, 0.0, sim.ego.speed), yaw_rate=jnp.where(hit, 0.0, sim.ego.yaw_rate)
+        happened[name] &= ~finished
+        ended |= happened[name]
+    completion = jnp.where(finished, 100.0, completion)
+    was_clean = sum(drive.counts[name] for name in HARD) == 0
+    whom = [struck if name in COLLISIONS else jnp.full((), -1, jnp.int32) for name in EVENTS]
+    return drive.replace(
+        state=state.replace(done=ended.astype(jnp.float32)),
+        counts={name: drive.counts[name] + happened[name].astype(jnp.int32) for name in EVENTS},
+        log=event_log.append(
+            drive.log,
+            jnp.stack([happened[name] for name in EVENTS]),
+            jnp.append(sim.ego.xy, sim.ego.z),
+            sim.step_count,
+            jnp.stack(whom),
+        ),
+        completion=completion,
+        clean_completion=jnp.where(was_clean, completion, drive.clean_completion),
+        min_speed=min_speed.finish_where(ended, drive.min_speed, route_s, length),
     )
-    agents = sim.agents.replace(kind=jnp.where(struck, KIND_NONE, sim.agents.kind))
-    return moved.replace(
-        pipeline_state=sim.replace(ego=halted, agents=agents), done=ended.astype(jnp.float32)
-    )
+
+
+def infractions(drive: Drive, struck: jax.Array, dt: float) -> dict[str, jax.Array]:
+    """What happened in the step that led to a drive, {name of EVENTS: () bool}.
+
+    Args:
+      drive: after the step.
+      struck: () int32, row of the agent whose collision is charged, -1 for none.
+      dt: s.
+    """
+    metrics, sim = drive.state.metrics, drive.state.pipeline_state
+    kind = sim.agents.kind[jnp.maximum(struck, 0)]
+    return {
+        **{name: (struck >= 0) & (kind == of) for name, of in COLLISIONS.items()},
+        **{name: metrics[f"reward/{name}"] > 0 for name in (*GOES_ON, "off_road")},
+        "scenario_timeout": sim.scenarios.has_timed_out,
+        "failed_to_yield": sim.scenarios.has_failed_to_yield,
+        "route_deviation": metrics["reward/route_deviation"] > 0,
+        "blocked": blocked.is_blocked(drive.stopped_s, BLOCKED_S, dt),
+        "timeout": sim.step_count.astype(jnp.float32) * dt > drive.time_limit_s + 0.5 * dt,
+    }
+
+
+def _goal_distance(env: DrivingEnv, sim: SimState) -> jax.Array:
+    """() m, from the ego to the last point of its route."""
+    routes = env.bank.routes
+    goal = routes.xy[sim.episode_idx, routes.num_points[sim.episode_idx] - 1]
+    return jnp.sqrt(((sim.ego.xy - goal) ** 2).sum())

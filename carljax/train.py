@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import sys
+import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
@@ -12,10 +13,22 @@ import jax
 import tyro
 from rich.console import Console
 
-from carljax import build, checkpoint, config, evaluate, learn, memory, presets, run_dir, scores
+from carljax import (
+    build,
+    checkpoint,
+    config,
+    courses,
+    evaluate,
+    learn,
+    memory,
+    presets,
+    run_dir,
+    score_table,
+)
 from carljax.build import Setup
 from carljax.checkpoint import CheckpointError
 from carljax.config import ConfigError, TrainConfig
+from carljax.drive import NetworkPolicy
 from carljax.sim.road_network import MapError
 from carljax.sim.route_generator import RouteError
 
@@ -131,11 +144,13 @@ def run(command: Command, console: Console) -> int:
 
 def score(made: Setup, params: Any, path: Path, console: Console) -> None:
     """Evaluates the policy on held-out routes; prints the table and writes evaluation.json."""
-    env = evaluate.held_out(made.config, made.towns, made.config.run.eval_routes)
-    names = [town.network.name for town in made.towns]
-    result = evaluate.evaluate(env, made.network, params, names)
-    scores.show(result, console)
-    evaluate.save(result, path / evaluate.FILE)
+    course = courses.held_out(made.config, made.towns, made.config.run.eval_routes)
+    since = time.perf_counter()
+    policy = NetworkPolicy(jax.device_get(params), made.network)
+    result = evaluate.evaluate(course, policy)
+    seconds = time.perf_counter() - since
+    score_table.show(result, console, title=course.title)
+    evaluate.save(result, path / evaluate.FILE, seconds, course=course.title)
 
 
 def describe(made: Setup, console: Console) -> None:

@@ -125,7 +125,7 @@ def test_the_run_directory_holds_what_it_should(runs):
     assert len(starts) == 2  # begun and continued
     assert starts[0]["packages"]["jax"] == jax.__version__
     assert starts[0]["maps"] == run_dir.map_digests(run_dir.load_config(folder))
-    scores = json.loads((folder / "evaluation.json").read_text())
+    scores = json.loads((folder / "evaluation.json").read_text())["carljax"]
     assert len(scores["routes"]) == 2
     assert {route["town"] for route in scores["routes"]} == {"village"}
 

@@ -61,7 +61,7 @@ def average(lines: Sequence[dict[str, float]], name: str) -> np.ndarray:
 def _draw_score(axes: plt.Axes, run: Path) -> None:
     path = run / evaluate.FILE
     if path.is_file():
-        score = json.loads(path.read_text(encoding="utf-8"))
+        score = json.loads(path.read_text(encoding="utf-8"))["carljax"]
         completion = score["route_completion_mean"]
         axes.axhline(completion, linestyle="--", color="C2", label="held-out, leaderboard's rules")
         clean = score["clean_completion_mean"]

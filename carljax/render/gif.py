@@ -12,7 +12,7 @@ import numpy as np
 from PIL import Image
 
 from carljax import drive
-from carljax.ppo.networks import ActorCritic
+from carljax.drive import Policy
 from carljax.render.episode_view import frame, read_world
 from carljax.sim.env import DrivingEnv
 from carljax.sim.types import State
@@ -23,23 +23,20 @@ MAX_FRAMES = 400
 NUM_COLOURS = 96
 
 
-def save(
-    path: Path, env: DrivingEnv, network: ActorCritic, params: Any, episode_idx: int, seed: int = 0
-) -> None:
-    """Drives one route with the deterministic policy and writes it as an animated GIF.
+def save(path: Path, env: DrivingEnv, policy: Policy, episode_idx: int, seed: int = 0) -> None:
+    """Drives one route and writes it as an animated GIF.
 
     Args:
       path: the file to write.
       env: with the route.
-      network: actor and critic.
-      params: its variables.
+      policy: who drives.
       episode_idx: row of the environment's bank.
       seed: of the traffic; 0 drives what `evaluate` drives.
     """
     world = read_world(env, episode_idx)
     frames = [
         frame(env, world, state, command)
-        for state, command in episode(env, network, params, episode_idx, seed)
+        for state, command in episode(env, policy, episode_idx, seed)
     ]
     path.parent.mkdir(parents=True, exist_ok=True)
     palette = frames[len(frames) // 2].quantize(NUM_COLOURS)
@@ -50,26 +47,25 @@ def save(
 
 
 def episode(
-    env: DrivingEnv, network: ActorCritic, params: Any, episode_idx: int, seed: int = 0
+    env: DrivingEnv, policy: Policy, episode_idx: int, seed: int = 0
 ) -> Iterator[tuple[State, np.ndarray]]:
     """Drives one route, giving every third state and the last.
 
     Args:
       env: with the route.
-      network: actor and critic.
-      params: its variables.
+      policy: who drives.
       episode_idx: row of the environment's bank.
       seed: of the traffic.
 
     Yields:
       The unbatched state on the host, and the (2,) action that led to it.
     """
-    step = drive.compiled(drive.step, network)
-    params = jax.device_get(params)
-    run = jax.jit(drive.start)(env, jnp.array([episode_idx]), jax.random.key(seed))
+    policy = policy.replace(needs_image=True)
+    step = drive.compiled(drive.step)
+    run = jax.jit(drive.start)(policy, env, jnp.array([episode_idx]), jax.random.key(seed))
     for number in range(1, MAX_FRAMES * FRAME_EVERY + 1):
-        run, command = step(env, params, run)
-        state = run.state
+        run, command = step(policy, env, run)
+        state = run.drive.state
         is_last = float(state.done[0]) > 0
         if is_last or number % FRAME_EVERY == 0:
             one = jax.tree.map(lambda x: x[0], state.replace(pipeline_state=_keyless(state)))
