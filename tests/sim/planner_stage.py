@@ -17,10 +17,20 @@ from traffic_world import ALL, World
 from carljax.planners import PLANNERS
 from carljax.reward import stop_line, stop_sign
 from carljax.reward.config import RewardConfig
-from carljax.sim import bicycle, env, episodes, geometry, population, route, situation
+from carljax.sim import (
+    bicycle,
+    env,
+    episodes,
+    geometry,
+    population,
+    route,
+    route_generator,
+    situation,
+)
 from carljax.sim.env import EnvConfig
 from carljax.sim.journey import Journey
-from carljax.sim.route_assembly import Segment, assemble
+from carljax.sim.route_assembly import RouteSizes, Segment, assemble
+from carljax.sim.town import offsets
 from carljax.sim.types import KIND_NONE, KIND_PEDESTRIAN, KIND_VEHICLE
 
 DT, STEPS = 0.1, 400
@@ -119,8 +129,8 @@ def _moved(agents, begin, speeds, starts, time, road_map):
     )
 
 
-@functools.partial(jax.jit, static_argnums=0)
-def _play(name, env, sim, begin, starts):
+@functools.partial(jax.jit, static_argnums=(0, 1))
+def _play(name, num_steps, env, sim, begin, starts):
     planner = PLANNERS[name]
     speeds = begin.speed
 
@@ -157,7 +167,7 @@ def _play(name, env, sim, begin, starts):
         }
         return (after, memory), seen
 
-    return jax.lax.scan(step, (sim, planner.init(env)), jnp.arange(STEPS))[1]
+    return jax.lax.scan(step, (sim, planner.init(env)), jnp.arange(num_steps))[1]
 
 
 _start = jax.jit(lambda env, episode, key: env.start_episode(episode, key).pipeline_state)
@@ -179,4 +189,18 @@ def play(world: World, planner: str, scene: Scene):
         route_idx=jnp.int32(scene.start),
         lights=sim.lights.replace(time=jnp.float32(scene.clock)),
     )
-    return jax.tree.map(np.asarray, _play(planner, env, sim, agents, starts))
+    return jax.tree.map(np.asarray, _play(planner, STEPS, env, sim, agents, starts))
+
+
+def drive_alone(town, planner: str, length: float, seed: int, num_steps: int):
+    """A drawn route in a town with nobody else: the route, and {name: (num_steps, ...)}."""
+    first = offsets([town])[0]
+    sizes = RouteSizes(int(length) + 1)
+    drawn = route_generator.draw(town, first, length, sizes, np.random.default_rng(seed))
+    bank = episodes.populate([town], [Journey(drawn)], CONFIG.population, 0)
+    alone = env.make_env(bank, CONFIG, RewardConfig())
+    sim = _start(alone, jnp.int32(0), jax.random.key(0))
+    nobody = population.nobody(NUM)
+    sim = sim.replace(agents=nobody)
+    path = _play(planner, num_steps, alone, sim, nobody, jnp.zeros(NUM, jnp.float32))
+    return drawn, jax.tree.map(np.asarray, path)

@@ -2,7 +2,8 @@
 
 import numpy as np
 import pytest
-from planner_stage import DT, Other, Scene, play
+import shapely
+from planner_stage import DT, Other, Scene, drive_alone, play
 
 from carljax.planners import PLANNERS
 from carljax.sim.types import KIND_PEDESTRIAN, LIGHT_RED
@@ -110,3 +111,15 @@ def test_pdm_lite_is_comfortable_on_an_empty_road(world):
     path = play(world, "pdm-lite", Scene("plain", turn="left", speed=0.0))
     jerk = np.diff(path["accel"]) / DT
     assert np.abs(jerk).max() < 30.0  # source: paper, table of comfort thresholds
+
+
+@BOTH
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_winding_route_is_driven_to_its_end_along_the_middle_of_its_lanes(bundled, planner, seed):
+    route, path = drive_alone(bundled["village"], planner, 300.0, seed, 800)
+    num = int(route.num_points)
+    assert path["route_idx"][-1] == num - 1
+    line = shapely.LineString(route.xy[:num])
+    on_route = path["route_idx"] < num - 1
+    away = shapely.distance(shapely.points(path["xy"][on_route].astype(float)), line)
+    assert away.max() < 0.5
