@@ -1,8 +1,8 @@
 """Random routes through a town's lane graph. Host only.
 
 A route starts at a random lane, goes forward in steps of 1 m, chooses uniformly at branches and
-changes lane with 10 % probability per metre outside junctions, at most once in 200 m. source:
-paper, Scenario Generation, and the authors' generator.
+changes lane with 10 % probability per metre outside junctions, where the paint allows it, at most
+once in 200 m. source: paper, Scenario Generation, and the authors' generator.
 """
 
 from __future__ import annotations
@@ -16,7 +16,8 @@ from carljax.sim.town import Offsets, Town
 
 LANE_CHANGE_PROB = 0.10  # per metre. source: authors' generator
 LANE_CHANGE_GAP = 200.0  # m. source: authors' generator
-LANE_CHANGE_MIN_WIDTH = 2.5  # m; no change onto a lane that is about to end or has just begun
+CHANGE_ROOM = 20.0  # m that a change keeps to the end of either lane. source: ours
+START_MIN_WIDTH = 2.5  # m; a car can't be put on a lane narrower than that. source: ours
 ATTEMPTS = 200
 
 
@@ -56,9 +57,11 @@ def draw(
 
 
 def _walk(town: Town, length: float, rng: np.random.Generator) -> list[Segment] | None:
-    """Lanes and the part of each that is driven, or None at a dead end."""
+    """Lanes and the part of each that is driven, or None at a dead end or a bad start."""
     table = town.lanes
     lane, s = _start(town, rng)
+    if _width(town, lane, s) < START_MIN_WIDTH:
+        return None
     segments: list[Segment] = []
     travelled = 0.0
     next_change = 0.0
@@ -95,6 +98,12 @@ def _start(town: Town, rng: np.random.Generator) -> tuple[int, float]:
     return row, float(rng.uniform(0.0, max(0.0, table.length[row] - 15.0)))
 
 
+def _width(town: Town, lane: int, s: float) -> float:
+    """Width of a lane at a place, m."""
+    width = town.lanes.point_width[town.lanes.points(lane)]
+    return float(np.interp(s, np.linspace(0.0, town.lanes.length[lane], len(width)), width))
+
+
 def _lane_change(
     town: Town, lane: int, s: float, end: float, earliest: float, rng: np.random.Generator
 ) -> tuple[float, int, float] | None:
@@ -103,35 +112,20 @@ def _lane_change(
     if table.junction[lane] is not None:
         return None
     ahead = earliest + rng.geometric(LANE_CHANGE_PROB)
-    # A change needs room: not within the last 20 m before a lane's end.
-    if s + ahead > min(end, float(table.length[lane]) - 20.0):
+    if s + ahead > min(end, float(table.length[lane]) - CHANGE_ROOM):
         return None
-    raw, distance = _raw_place(town, lane, s + ahead)
-    here = town.network.lanes[raw]
-    sides = [
-        side
-        for side, same in (
-            (here.left, here.left_is_same_direction),
-            (here.right, here.right_is_same_direction),
-        )
-        if side >= 0 and same and table.raw_lane[side] != lane
-    ]
-    if not sides:
+    spacing = float(table.length[lane]) / (int(table.num_points[lane]) - 1)
+    number = round((s + ahead) / spacing)
+    point = int(table.start[lane]) + number
+    both = (town.neighbours.left[point], town.neighbours.right[point])
+    beside = [int(row) for row in both if row >= 0]
+    if not beside:
         return None
-    side = int(rng.choice(sides))
-    there = town.network.lanes[side]
-    to = route_assembly.beside(here, distance, there)
-    if np.interp(to, route_assembly.along(there), there.width) < LANE_CHANGE_MIN_WIDTH:
+    to = int(rng.choice(beside))
+    lane_to = int(table.point_lane[to])
+    step = float(table.length[lane_to]) / (int(table.num_points[lane_to]) - 1)
+    # As far beyond that point as the place that is left lies beyond its own.
+    s_to = (to - int(table.start[lane_to])) * step + (s + ahead - number * spacing)
+    if s_to > float(table.length[lane_to]) - CHANGE_ROOM:
         return None
-    place = table.place(side, to)
-    if place.s > table.length[place.lane] - 20.0:
-        return None
-    return s + ahead, place.lane, place.s
-
-
-def _raw_place(town: Town, lane: int, s: float) -> tuple[int, float]:
-    """The raw lane under a place of the table, and the distance along it."""
-    members = town.lanes.members[lane]
-    starts = town.lanes.raw_start[members]
-    number = max(0, int(np.searchsorted(starts, s, side="right")) - 1)
-    return members[number], s - float(starts[number])
+    return s + ahead, lane_to, max(s_to, 0.0)

@@ -1,5 +1,7 @@
 """Routes: drawn along the lane graph, with their lines and signs; the window; progress by hand."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -309,3 +311,29 @@ def test_advance_looks_along_each_points_own_direction():
 def test_distance_by_hand(idx, xy, expected):
     got = distance(EAST, jnp.int32(idx), jnp.asarray(xy, jnp.float32))
     np.testing.assert_allclose(got, expected, atol=1e-6)
+
+
+def test_lane_changes_only_where_the_paint_allows_one(bundled):
+    there = bundled["highway"]
+    table, num = there.lanes, 0
+    for seed in range(NUM_ROUTES):
+        lane, s = lanes(draw_in(there, seed))
+        for i in range(1, len(lane)):
+            if is_change(table, lane, i):
+                spacing = table.length[lane[i - 1]] / (table.num_points[lane[i - 1]] - 1)
+                # the change lies within the metre after the point before it
+                rows = table.start[lane[i - 1]] + np.rint((s[i - 1] + np.array([0, 1])) / spacing)
+                beside = [side[rows.astype(int)] for side in vars(there.neighbours).values()]
+                assert (table.point_lane[np.concatenate(beside)] == lane[i]).any()
+                num += 1
+    assert num > NUM_ROUTES
+
+
+def test_no_route_begins_on_a_lane_too_narrow_for_a_car():
+    wide = straight((0, 0), (100, 0))
+    opening = dataclasses.replace(wide, width=np.clip(wide.xyz[:, 0] / 20.0, 0.0, 3.5))
+    there = town.from_network(network([opening]))
+    for seed in range(30):
+        found = draw_in(there, seed, length=20.0, sizes=RouteSizes(30))
+        # 2.5 m are reached at x = 50; the town's middle is there too
+        assert found.xy[0, 0] >= -0.5
