@@ -18,6 +18,7 @@ BESIDE = 0.75  # m kept to a vehicle's sides: half a body and half a metre
 IN_FRONT = 1.25  # m kept to a vehicle that stands in its way, likewise and a step
 ROLLING = 0.5  # m/s, slower vehicles are taken to stand
 PICK_UP = 1.5  # m/s by which a rolling vehicle may yet be faster. source: ours, a second of green
+STOPS_SHORT = 2.0  # m before the pedestrian's way at which a braking vehicle is seen to stop
 # What a driver needs to stop: time to see and m/s^2. source: textbook values, half of a full stop
 REACTION_S, DRIVER_BRAKING = 1.0, 4.0
 # A vehicle may come to any place in a cone before it: half its width at the front, and its slope.
@@ -58,7 +59,8 @@ class Meeting(struct.PyTreeNode):
     """What each pedestrian sees of each vehicle, all (W, V + 1); the ego is the last.
 
     Attributes:
-      comes: bool, it rolls towards what the pedestrian has still to walk.
+      comes: bool, it rolls towards what the pedestrian has still to walk and isn't seen to stop
+        before it.
       distance: m, from its front to that, in a straight line and so never too long.
       speed: m/s, its own.
       enter, leave: m along the pedestrian's way, the piece that the vehicle may sweep over.
@@ -156,15 +158,19 @@ def meetings(
     off_x = jnp.clip(x, 0.0, still) - x
     forward = off_x * to_x - y * to_y
     across = abs(off_x * to_y + y * to_x)
+    distance = jnp.maximum(jnp.sqrt(off_x**2 + y**2) - half_length, 0.0)
+    braking = jnp.maximum(-jnp.append(others.accel, ego.accel), 0.1)
+    stops_short = speed**2 / (2 * braking) < distance - STOPS_SHORT
     # Where their ways meet if it keeps its lane, or else its direction: the later of the two.
     straight = x + abs(y) * to_x / jnp.maximum(abs(to_y), 0.2)
     meet = jnp.clip(jnp.maximum(x, straight), 0.0, still)
     return Meeting(
         comes=exists
         & (speed > ROLLING)
+        & ~stops_short
         & (forward > 0.0)
         & (across < CONE_SIDE + CONE_SLOPE * forward),
-        distance=jnp.maximum(jnp.sqrt(off_x**2 + y**2) - half_length, 0.0),
+        distance=distance,
         speed=jnp.broadcast_to(speed, x.shape),
         enter=meet - half_width - BESIDE,
         leave=meet + half_width + BESIDE,
