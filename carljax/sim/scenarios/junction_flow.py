@@ -33,7 +33,8 @@ ARM_CLEARANCE = 4.0  # m kept to an arm's beginning. source: ours
 FARTHEST_SINK = 90.0  # m beyond the junction, out of sight. source: ours
 # m from the trigger to the junction. source: ours
 TRIGGER_AHEAD = (20.0, 110.0)
-# s by which an ego at the limit comes after the first car of the stream may. source: ours
+# s from when the first car of a stream can be at the meeting to when an ego at the limit is there.
+# source: ours, one or two cars come before it
 LATE = (0.0, 4.0)
 SAME_DIRECTION = np.pi / 4  # rad by which an arm may differ from the side it is on. source: ours
 
