@@ -242,14 +242,18 @@ def meeting(site: Site, first: int, last: int, other: Way) -> tuple[float, float
       other: crosses the route or merges with it.
 
     Returns:
-      Arc length on the route and on the other line, m; None where they do not meet.
+      Arc length on the route and on the other line, m, of where they cross, or of where they have
+      merged; None where they do not meet.
     """
     ours = np.asarray(site.route.xy[first : last + 1], float)
     gap = np.hypot(*(ours[:, None, :] - other.xy[None, :, :]).transpose(2, 0, 1))
-    met = np.flatnonzero(gap.min(axis=1) < MEET_GAP)
+    nearest = gap.min(axis=1)
+    met = np.flatnonzero(nearest < MEET_GAP)
     if len(met) == 0:
         return None
-    at = int(met[0])
+    run = met[: 1 + int((np.diff(met, append=-1) != 1).argmax())]
+    merged = run[-1] == last - first
+    at = int(run[0] if merged else run[nearest[run].argmin()])
     return float(site.route.s[first + at]), float(other.s[int(gap[at].argmin())])
 
 
