@@ -80,6 +80,12 @@ def test_they_set_out_before_cars_that_stand(road_map):
     assert waits(road_map, car(-5.0, -1.75, 1.0))
 
 
+@pytest.mark.parametrize(("accel", "waiting"), [(-3.0, False), (-1.0, True), (0.0, True)])
+def test_they_see_that_a_car_brakes_to_a_halt(road_map, accel, waiting):
+    # From 10 m/s it takes 10^2 / (2 * 3) = 16.7 m or 50 m; there are 38 m to its front.
+    assert waits(road_map, car(-40.0, -1.75, 10.0).replace(accel=f32([accel]))) == waiting
+
+
 @pytest.mark.parametrize("is_reckless", [False, True])
 def test_nobody_walks_into_a_car_that_stands_on_the_crosswalk(road_map, is_reckless):
     # Its side is at y = -2.75, 1.15 m from the kerb.
