@@ -170,9 +170,13 @@ class DrivingEnv(struct.PyTreeNode):
         dt, road_map = self.config.dt, self.bank.road_map
         stretch, first = route.window(self.bank.routes, before.episode_idx, before.route_idx)
         idx = before.route_idx - first
-        played = engine.scripts(self.bank.scenarios, before.episode_idx, before.scenarios)
-        route_s = engine.progress(stretch, idx, before.ego)
-        action = engine.disturb(action, before.scenarios, played, route_s)
+        action = engine.disturb(
+            action,
+            before.scenarios,
+            self.bank.scenarios,
+            before.episode_idx,
+            engine.progress(stretch, idx, before.ego),
+        )
         ego = bicycle.step(before.ego, *bicycle.from_action(action), self.vehicle, dt)
         place = situation.ego_place(before.ego, road_map, stretch, idx)
         rows = self.config.population
@@ -203,9 +207,10 @@ class DrivingEnv(struct.PyTreeNode):
         idx = route.advance(stretch, idx, ego.xy)
         slots, agents, clock = engine.step(
             before.scenarios,
-            played,
             agents,
             before.lights.replace(time=before.lights.time + dt),
+            self.bank.scenarios,
+            before.episode_idx,
             self._scene(ego, place, engine.progress(stretch, idx, ego), is_start=False),
             key_scenarios,
             dt,

@@ -107,10 +107,3 @@ def join(*parts: Agents) -> Agents:
 def rows(agents: Agents, part: slice) -> Agents:
     """Some rows of agents."""
     return jax.tree.map(lambda x: x[part], agents)
-
-
-def with_scenarios(agents: Agents, cars: Agents, others: Agents, population: Population) -> Agents:
-    """Agents with other rows of the scenarios' cars and others."""
-    before = rows(agents, population.traffic)
-    after = rows(agents, population.walkers)
-    return join(before, cars, others, after)

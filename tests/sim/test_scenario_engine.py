@@ -55,9 +55,9 @@ def scene(road_map, x, speed, is_start=False):
 @jax.jit
 def _step(state, scenarios, road_map, x, speed, key):
     slots, agents, clock = state
-    played = engine.scripts(scenarios, jnp.int32(0), slots)
     clock = clock.replace(time=clock.time + DT)
-    return engine.step(slots, played, agents, clock, scene(road_map, x, speed), key, DT)
+    at = scene(road_map, x, speed)
+    return engine.step(slots, agents, clock, scenarios, jnp.int32(0), at, key, DT)
 
 
 @jax.jit
@@ -492,7 +492,7 @@ ICE = PLAIN | {
 
 @jax.jit
 def _disturb(action, slots, scenarios, x):
-    return engine.disturb(action, slots, engine.scripts(scenarios, jnp.int32(0), slots), x)
+    return engine.disturb(action, slots, scenarios, jnp.int32(0), x)
 
 
 def disturbance(world, x):

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
+from flax import struct
 
 from carljax.sim import geometry, population
 from carljax.sim.route import Route
@@ -32,16 +33,15 @@ FAR = 1e3  # m
 LATE = 3.0
 
 
-def scripts(scenarios: Scenario, episode_idx: jax.Array, slots: ScenarioSlots) -> Scenario:
-    """The rows that a step needs, (H + 1): of the scenarios in the slots and, last, the next one.
+def scripts(scenarios: Scenario, episode_idx: jax.Array, index: jax.Array) -> Scenario:
+    """Rows of the bank's scenarios, of the index's shape; kind is -1 where there is none.
 
     Args:
       scenarios: the bank's, leading axes S, E.
       episode_idx: () int32.
-      slots: see `ScenarioSlots`.
+      index: (...) int32.
     """
     num = scenarios.kind.shape[1]
-    index = jnp.append(slots.index, slots.next_index)
     found = jax.tree.map(lambda x: x[episode_idx, jnp.clip(index, 0, num - 1)], scenarios)
     return found.replace(kind=jnp.where((index >= 0) & (index < num), found.kind, -1))
 
@@ -53,17 +53,22 @@ def progress(stretch: Route, idx: jax.Array, ego: EgoState) -> jax.Array:
 
 
 def disturb(
-    action: jax.Array, slots: ScenarioSlots, played: Scenario, route_s: jax.Array
+    action: jax.Array,
+    slots: ScenarioSlots,
+    scenarios: Scenario,
+    episode_idx: jax.Array,
+    route_s: jax.Array,
 ) -> jax.Array:
     """(2,) the action as the car takes it: on the patches of a scenario it is not what was meant.
 
     Args:
       action: (2,) steering and longitudinal.
       slots: see `ScenarioSlots`.
-      played: (H + 1,) see `scripts`.
+      scenarios: the bank's.
+      episode_idx: () int32.
       route_s: () m, see `progress`.
     """
-    script = _in_slots(played)
+    script = scripts(scenarios, episode_idx, slots.index)
     on = (script.patches[..., 0] <= route_s) & (route_s < script.patches[..., 1])
     on &= slots.is_playing[:, None]
     half_width = jnp.stack([script.steer_noise, script.throttle_noise], axis=-1)[:, None]
@@ -96,9 +101,10 @@ def start(
         carry: tuple[ScenarioSlots, Agents], key: jax.Array
     ) -> tuple[tuple[ScenarioSlots, Agents], None]:
         slots, agents = carry
-        played = scripts(scenarios, episode_idx, slots)
-        slots, played, agents = _arm(slots, played, agents, scene, key)
-        return _cars(slots, _in_slots(played), agents, scene), None
+        cast = _cast(agents, scene)
+        slots, script, cast = _arm(slots, scenarios, episode_idx, cast, agents, scene, key)
+        slots, cast = _cars(slots, script, cast, agents, scene)
+        return (slots, _with_cast(agents, cast, scene)), None
 
     if scene.rows.num_slots == 0:
         return slots, agents
@@ -108,9 +114,10 @@ def start(
 
 def step(
     slots: ScenarioSlots,
-    played: Scenario,
     agents: Agents,
     clock: LightClock,
+    scenarios: Scenario,
+    episode_idx: jax.Array,
     scene: Scene,
     key: jax.Array,
     dt: float,
@@ -119,9 +126,10 @@ def step(
 
     Args:
       slots: before.
-      played: (H + 1,) see `scripts`.
       agents: (N,) after traffic has moved.
       clock: of the lights, after the step.
+      scenarios: the bank's.
+      episode_idx: () int32.
       scene: after the ego's step.
       key: PRNG key.
       dt: s.
@@ -131,26 +139,52 @@ def step(
     """
     if scene.rows.num_slots == 0:
         return slots, agents, clock
-    slots, played, agents = _arm(slots, played, agents, scene, key)
-    script = _in_slots(played)
+    cast = _cast(agents, scene)
+    slots, script, cast = _arm(slots, scenarios, episode_idx, cast, agents, scene, key)
     slots, clock = _trigger(slots, script, clock, scene, dt)
-    slots, clock = _end(slots, script, clock, agents, scene)
-    slots, agents = _others(slots, script, agents, scene, dt)
-    slots, agents = _cars(slots, script, agents, scene)
-    slots, agents = _brake(slots, script, agents, scene, dt)
-    return *_leave(slots, agents, scene), clock
+    slots, clock = _end(slots, script, clock, cast, scene)
+    slots, cast = _others(slots, script, cast, scene, dt)
+    slots, cast = _cars(slots, script, cast, agents, scene)
+    slots, is_braking_hard = _brake(slots, script, agents, scene, dt)
+    slots, cast = _leave(slots, cast, scene)
+    agents = _with_cast(agents, cast, scene)
+    return slots, agents.replace(is_braking_hard=is_braking_hard), clock
 
 
-def _in_slots(played: Scenario) -> Scenario:
-    """(H,) the scenarios in the slots, without the next one."""
-    return jax.tree.map(lambda x: x[:-1], played)
+class Cast(struct.PyTreeNode):
+    """The rows of all scenarios: cars (H * NUM_CARS,), others (H * NUM_OTHERS,)."""
+
+    cars: Agents
+    others: Agents
+
+
+def _cast(agents: Agents, scene: Scene) -> Cast:
+    return Cast(
+        population.rows(agents, scene.rows.cars), population.rows(agents, scene.rows.others)
+    )
+
+
+def _with_cast(agents: Agents, cast: Cast, scene: Scene) -> Agents:
+    before = population.rows(agents, scene.rows.traffic)
+    after = population.rows(agents, scene.rows.walkers)
+    return population.join(before, cast.cars, cast.others, after)
 
 
 def _arm(
-    slots: ScenarioSlots, played: Scenario, agents: Agents, scene: Scene, key: jax.Array
-) -> tuple[ScenarioSlots, Scenario, Agents]:
-    """Gives the next scenario a slot, if it is time and its actors can take their places."""
-    coming = jax.tree.map(lambda x: x[-1], played)
+    slots: ScenarioSlots,
+    scenarios: Scenario,
+    episode_idx: jax.Array,
+    cast: Cast,
+    agents: Agents,
+    scene: Scene,
+    key: jax.Array,
+) -> tuple[ScenarioSlots, Scenario, Cast]:
+    """Gives the next scenario a slot, if it is time and its actors can take their places.
+
+    Returns:
+      The slots, what is played in them (H,), and their actors.
+    """
+    coming = scripts(scenarios, episode_idx, slots.next_index)
     free = slots.index < 0
     slot = jnp.argmax(2 * free + slots.is_leaving)
     exists = coming.kind >= 0
@@ -158,31 +192,26 @@ def _arm(
     arms = exists & ~missed & (scene.route_s >= coming.arm_s)
     arms &= (free | slots.is_leaving)[slot] & _has_room(coming, agents, scene)
     taken = arms & (jnp.arange(scene.rows.num_slots) == slot)
-
-    def fill(new: jax.Array, old: jax.Array) -> jax.Array:
-        return jnp.where(taken.reshape(-1, *[1] * (old.ndim - 1)), new, old)
-
-    played = jax.tree.map(lambda x: x.at[:-1].set(fill(x[-1], x[:-1])), played)
     noise = jax.random.uniform(key, slots.noise.shape, minval=-1.0)
     slots = slots.replace(
-        index=fill(slots.next_index, slots.index),
+        index=jnp.where(taken, slots.next_index, slots.index),
         is_leaving=slots.is_leaving & ~taken,
-        triggered_s=fill(jnp.float32(-1.0), slots.triggered_s),
+        triggered_s=jnp.where(taken, -1.0, slots.triggered_s),
         has_appeared=slots.has_appeared & ~taken[:, None],
         has_started=slots.has_started & ~taken[:, None],
-        moved=fill(jnp.float32(0.0), slots.moved),
-        noise=fill(noise, slots.noise),
-        braker=fill(jnp.int32(-1), slots.braker),
-        braked_s=fill(jnp.float32(0.0), slots.braked_s),
+        moved=jnp.where(taken[:, None], 0.0, slots.moved),
+        noise=jnp.where(taken[:, None, None], noise, slots.noise),
+        braker=jnp.where(taken, -1, slots.braker),
+        braked_s=jnp.where(taken, 0.0, slots.braked_s),
         next_index=slots.next_index + (arms | missed),
     )
-    rows = scene.rows
-    cars = population.rows(agents, rows.cars)
-    cars = actors.take_away(cars, jnp.repeat(taken, NUM_CARS))
-    others = population.rows(agents, rows.others)
+    script = scripts(scenarios, episode_idx, slots.index)
     appears = jnp.repeat(taken, NUM_OTHERS)
-    others = actors.put_others(others, appears, actors.flat(_in_slots(played).others))
-    return slots, played, population.with_scenarios(agents, cars, others, rows)
+    cast = Cast(
+        actors.take_away(cast.cars, jnp.repeat(taken, NUM_CARS)),
+        actors.put_others(cast.others, appears, actors.flat(script.others)),
+    )
+    return slots, script, cast
 
 
 def _has_room(coming: Scenario, agents: Agents, scene: Scene) -> jax.Array:
@@ -219,13 +248,13 @@ def _trigger(
 
 
 def _end(
-    slots: ScenarioSlots, script: Scenario, clock: LightClock, agents: Agents, scene: Scene
+    slots: ScenarioSlots, script: Scenario, clock: LightClock, cast: Cast, scene: Scene
 ) -> tuple[ScenarioSlots, LightClock]:
     """Ends what the ego has passed or what takes too long: one a step, so that none goes unseen."""
     passed = scene.route_s >= script.end_s
     over = slots.is_playing & (passed | (slots.triggered_s > script.timeout_s))
     ends = over & (jnp.cumsum(over) == 1)
-    cars = population.rows(agents, scene.rows.cars)
+    cars = cast.cars
     behind = geometry.to_frame(cars.xy, scene.ego.xy, scene.ego.yaw)[:, 0] < 0.0
     flat = actors.flat(script.cars)
     # Nobody can give way to one that crosses: only what comes along the ego's own way counts.
@@ -242,26 +271,24 @@ def _end(
 
 
 def _others(
-    slots: ScenarioSlots, script: Scenario, agents: Agents, scene: Scene, dt: float
-) -> tuple[ScenarioSlots, Agents]:
+    slots: ScenarioSlots, script: Scenario, cast: Cast, scene: Scene, dt: float
+) -> tuple[ScenarioSlots, Cast]:
     """Lets those off the lanes start, and moves them."""
-    others = population.rows(agents, scene.rows.others)
     flat = actors.flat(script.others)
     starts = actors.starts_moving(flat, _cues(slots, NUM_OTHERS), scene)
     started = slots.has_started | starts.reshape(slots.has_started.shape)
     others, moved = actors.move_others(
-        others, flat, started.reshape(-1), slots.moved.reshape(-1), dt
+        cast.others, flat, started.reshape(-1), slots.moved.reshape(-1), dt
     )
     slots = slots.replace(has_started=started, moved=moved.reshape(slots.moved.shape))
-    cars = population.rows(agents, scene.rows.cars)
-    return slots, population.with_scenarios(agents, cars, others, scene.rows)
+    return slots, cast.replace(others=others)
 
 
 def _cars(
-    slots: ScenarioSlots, script: Scenario, agents: Agents, scene: Scene
-) -> tuple[ScenarioSlots, Agents]:
+    slots: ScenarioSlots, script: Scenario, cast: Cast, agents: Agents, scene: Scene
+) -> tuple[ScenarioSlots, Cast]:
     """Lets cars on lanes take their places when it is their turn, and tells them how to drive."""
-    cars = population.rows(agents, scene.rows.cars)
+    cars = cast.cars
     flat, cues = actors.flat(script.cars), _cues(slots, NUM_CARS)
     came = actors.way(cars, flat, scene.road_map)
     waits = actors.waiting(cars, slots.has_appeared.reshape(-1), flat, cues, came)
@@ -273,15 +300,13 @@ def _cars(
     cars = actors.put_cars(cars, starts, flat, at, scene.road_map)
     cars = actors.command_cars(cars, flat, cues, jnp.where(starts, flat.s, came), scene)
     appeared = slots.has_appeared | starts.reshape(slots.has_appeared.shape)
-    others = population.rows(agents, scene.rows.others)
-    agents = population.with_scenarios(agents, cars, others, scene.rows)
-    return slots.replace(has_appeared=appeared), agents
+    return slots.replace(has_appeared=appeared), cast.replace(cars=cars)
 
 
 def _brake(
     slots: ScenarioSlots, script: Scenario, agents: Agents, scene: Scene, dt: float
-) -> tuple[ScenarioSlots, Agents]:
-    """Makes the car ahead of the ego brake, once there is one."""
+) -> tuple[ScenarioSlots, jax.Array]:
+    """Makes the car ahead of the ego brake, once there is one: (N,) bool, who brakes hard."""
     num = scene.rows.num_vehicles
     leader, gap = _leader(population.rows(agents, scene.rows.vehicles), scene)
     plays = slots.is_playing & (script.brake_s > 0.0)
@@ -291,7 +316,7 @@ def _brake(
     hard = (braker[:, None] == jnp.arange(num)) & brakes[:, None]
     hard = jnp.append(hard.any(axis=0), jnp.zeros(scene.rows.num_agents - num, bool))
     braked = slots.braked_s + jnp.where(brakes, dt, 0.0)
-    return slots.replace(braker=braker, braked_s=braked), agents.replace(is_braking_hard=hard)
+    return slots.replace(braker=braker, braked_s=braked), hard
 
 
 def _leader(vehicles: Agents, scene: Scene) -> tuple[jax.Array, jax.Array]:
@@ -307,20 +332,22 @@ def _leader(vehicles: Agents, scene: Scene) -> tuple[jax.Array, jax.Array]:
     return leader.astype(jnp.int32), gap[leader]
 
 
-def _leave(slots: ScenarioSlots, agents: Agents, scene: Scene) -> tuple[ScenarioSlots, Agents]:
+def _leave(slots: ScenarioSlots, cast: Cast, scene: Scene) -> tuple[ScenarioSlots, Cast]:
     """Takes away whom nobody sees once a scenario is over; without any, its slot is free."""
-    cars = population.rows(agents, scene.rows.cars)
-    others = population.rows(agents, scene.rows.others)
-    cars, others = (
-        actors.take_away(part, jnp.repeat(slots.is_leaving, num) & actors.is_hidden(part.xy, scene))
-        for part, num in ((cars, NUM_CARS), (others, NUM_OTHERS))
-    )
-    here = [part.valid.reshape(len(slots.index), -1).any(axis=1) for part in (cars, others)]
-    empty = slots.is_leaving & ~here[0] & ~here[1]
+
+    def without(part: Agents, num: int) -> Agents:
+        leaves = jnp.repeat(slots.is_leaving, num) & actors.is_hidden(part.xy, scene)
+        return actors.take_away(part, leaves)
+
+    cast = Cast(without(cast.cars, NUM_CARS), without(cast.others, NUM_OTHERS))
+    num = len(slots.index)
+    here = cast.cars.valid.reshape(num, -1).any(axis=1)
+    here |= cast.others.valid.reshape(num, -1).any(axis=1)
+    empty = slots.is_leaving & ~here
     slots = slots.replace(
         index=jnp.where(empty, -1, slots.index), is_leaving=slots.is_leaving & ~empty
     )
-    return slots, population.with_scenarios(agents, cars, others, scene.rows)
+    return slots, cast
 
 
 def _cues(slots: ScenarioSlots, num: int) -> Cues:
