@@ -54,7 +54,7 @@ class Gaps(struct.PyTreeNode):
     """Whom a place on a lane has before and behind it, (M,).
 
     Attributes:
-      ahead, behind: m between bumpers, FAR where there is nobody.
+      ahead, behind: m between bumpers, infinite where there is nobody.
       leader_speed: m/s.
       follower_speed, follower_desired: m/s.
       follower: its driver model.
@@ -218,15 +218,15 @@ def judge(
     behind_then = follower(new, new.behind, cars.speed)
     left_now = follower(old, old.behind, cars.speed)
     left_then = follower(old, old.behind + length + old.ahead, old.leader_speed)
-    gain = jnp.where(new.behind < FAR, behind_then - behind_now, 0.0)
-    gain += jnp.where(old.behind < FAR, left_then - left_now, 0.0)
+    gain = jnp.where(new.behind < jnp.inf, behind_then - behind_now, 0.0)
+    gain += jnp.where(old.behind < jnp.inf, left_then - left_now, 0.0)
     gain = goes - stays + POLITENESS * gain
     must = _ends(cars.lanes, cars.lane_s, road_map)
     bound = -jnp.where(must, SAFE_BRAKING, POLITE_BRAKING)
     safe = (new.ahead > MIN_GAP) & (new.behind > MIN_GAP) & (goes > bound)
     # Nobody stands so near ahead that there is no way around.
     safe &= old.ahead + ROOM_TIME * old.leader_speed > PULL_OUT
-    safe &= (behind_then > bound) | (new.behind >= FAR)
+    safe &= (behind_then > bound) | jnp.isinf(new.behind)
     return gain, safe
 
 
@@ -284,13 +284,13 @@ def gaps(
     nearest, follows = ahead.min(axis=1), behind.min(axis=1)
 
     # Of whoever is nearest: no search by index, which costs more than all the rest.
-    def of(is_it: jax.Array, values: jax.Array) -> jax.Array:
+    def of(is_it: jax.Array, values: jax.Array | float) -> jax.Array:
         return jnp.where(is_it, values, 0.0).max(axis=1)
 
     leads, comes = ahead == nearest[:, None], behind == follows[:, None]
     return Gaps(
-        ahead=jnp.where(nearest < 0.5 * FAR, nearest, FAR),
-        behind=jnp.where(follows < 0.5 * FAR, follows, FAR),
+        ahead=jnp.where(nearest < 0.5 * FAR, nearest, jnp.inf),
+        behind=jnp.where(follows < 0.5 * FAR, follows, jnp.inf),
         leader_speed=of(leads, movers.speed),
         follower_speed=of(comes, movers.speed),
         follower_desired=of(comes, others.desired),

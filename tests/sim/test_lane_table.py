@@ -195,3 +195,13 @@ def test_exits_of_the_crossing_have_three_ways_in():
     for arm in ("east", "north", "west", "south"):
         assert len(table.predecessors[table.raw_lane[leaving(arm)]]) == 3
         assert (table.successors[table.raw_lane[approach(arm)]] >= 0).sum() == 3
+
+
+def test_a_lane_that_tapers_to_nothing_ends_where_it_is_too_narrow():
+    taper = np.interp(np.arange(41), [0, 20, 40], [3.5, 3.5, 0.0])
+    # 3.5 m less 0.175 m for each metre beyond 20: 2.625 m wide at 25 m, 2.45 m at 26 m
+    pieces = [straight((0, 0), (40, 0), width=taper), straight((40, 0), (80, 0))]
+    np.testing.assert_allclose(lane_table.build(network(pieces)).end, [25.0, 40.0])
+    # where it goes on it ends where it ends
+    linked = lane_table.build(network(link(pieces, [(0, 1)])))
+    np.testing.assert_allclose(linked.end, linked.length)

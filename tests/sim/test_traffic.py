@@ -286,6 +286,13 @@ def test_cars_hardly_ever_touch(minute, name):
     assert of_town(touching, TOWN_ORDER.index(name)).mean() < 0.01
 
 
+def test_lane_changes_touch_nobody(minute):
+    path, touching, _ = (of_town(x, TOWN_ORDER.index("highway")) for x in minute)
+    changing = path.from_lane >= 0
+    assert (changing[:, 1:] & ~changing[:, :-1]).sum() > 20
+    assert not touching[changing.any(axis=2)].any()
+
+
 @pytest.mark.parametrize("name", TOWN_ORDER)
 def test_traffic_keeps_flowing(minute, name):
     path = of_town(minute[0], TOWN_ORDER.index(name))
