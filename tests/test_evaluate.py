@@ -323,6 +323,24 @@ def test_a_bank_is_driven_in_the_world_as_it_is_by_default(bank):
     np.testing.assert_array_equal(same.env.bank.routes.xy, course.env.bank.routes.xy)
 
 
+def test_a_route_file_is_a_course_under_its_own_names(course, tmp_path):
+    """Route 1 of the village as a file of leaderboard 2.0: every 20 m, y to the south."""
+    routes, town = course.env.bank.routes, course.towns[0]
+    xy = np.asarray(routes.xy[1], float)[: int(routes.num_points[1])] + town.offset
+    points = "".join(f'<position x="{x:.3f}" y="{-y:.3f}" z="0"/>' for x, y in xy[::20])
+    file = tmp_path / "routes.xml"
+    file.write_text(
+        f'<routes><route id="17" town="village"><waypoints>{points}</waypoints>'
+        "<scenarios/></route></routes>"
+    )
+    read = courses.of_route_file(CONFIG, file, towns.path("village").parent, None, None)
+    assert (read.title, read.route_ids) == ("routes.xml", ("17",))
+    assert read.num_scenarios.tolist() == [0]
+    driven = np.asarray(read.env.bank.routes.xy[0]) + read.towns[0].offset
+    away = np.hypot(*(driven[:, None] - xy[:260]).transpose(2, 0, 1)).min(axis=0)
+    assert away.max() < 1.0
+
+
 @pytest.mark.slow
 def test_a_planner_drives_without_a_checkpoint(bank, tmp_path, capsys):
     out = tmp_path / "planner.json"
