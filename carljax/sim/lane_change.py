@@ -13,10 +13,11 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from carljax.sim import geometry, idm, vehicles
+from carljax.sim import geometry, idm, lane_gaps, vehicles
 from carljax.sim.idm import IDMParams
+from carljax.sim.lane_gaps import Gaps
 from carljax.sim.lane_plan import plan
-from carljax.sim.lane_shift import AT_ONCE, FAR, changing, with_leaving
+from carljax.sim.lane_shift import AT_ONCE, FAR
 from carljax.sim.right_of_way import Mover, planned_lane
 from carljax.sim.road_map import RoadMap
 from carljax.sim.types import Agents
@@ -34,38 +35,6 @@ TRIES = 8  # cars that look beside in a step: each one about twice a second. sou
 LEAVES_FROM = 10.0  # m after a lane's beginning: no changes on the way out of a junction
 ROOM, ROOM_TIME = 20.0, 3.5  # m and s at the present speed that a change needs before a junction
 LANE_ENDS = 150.0  # m before its end a lane is left. source: ours, about where signs warn
-
-
-class Others(struct.PyTreeNode):
-    """Whom a car may come between, (N + 1 + AT_ONCE,): agents, the ego, cars that leave a lane.
-
-    Attributes:
-      mover: where they are.
-      desired: m/s, free speed.
-      driver: their driver model, arrays like the others.
-    """
-
-    mover: Mover
-    desired: jax.Array
-    driver: IDMParams
-
-
-class Gaps(struct.PyTreeNode):
-    """Whom a place on a lane has before and behind it, (M,).
-
-    Attributes:
-      ahead, behind: m between bumpers, infinite where there is nobody.
-      leader_speed: m/s.
-      follower_speed, follower_desired: m/s.
-      follower: its driver model.
-    """
-
-    ahead: jax.Array
-    behind: jax.Array
-    leader_speed: jax.Array
-    follower_speed: jax.Array
-    follower_desired: jax.Array
-    follower: IDMParams
 
 
 class Change(struct.PyTreeNode):
@@ -197,10 +166,10 @@ def judge(
       too hard for it.
     """
     cars = jax.tree.map(lambda x: x[rows], agents)
-    others = _others(agents, movers, desired, road_map, params)
+    everybody = lane_gaps.others(agents, movers, desired, road_map, params)
     length = cars.length
-    old = gaps(cars.lanes, cars.lane_s, length, rows, others, road_map)
-    new = gaps(change.lanes, change.s, length, rows, others, road_map)
+    old = lane_gaps.gaps(cars.lanes, cars.lane_s, length, rows, everybody, road_map)
+    new = lane_gaps.gaps(change.lanes, change.s, length, rows, everybody, road_map)
     own = vehicles.driver(cars.model, params)
     faster = road_map.lane_speed_limit[jnp.maximum(change.lanes[:, 0], 0)]
     faster = faster / road_map.lane_speed_limit[planned_lane(cars, 0)]
@@ -208,19 +177,8 @@ def judge(
     stays = idm.acceleration(cars.speed, old.ahead, old.leader_speed, free, own)
     goes = idm.acceleration(cars.speed, new.ahead, new.leader_speed, free * faster, own)
 
-    def follower(side: Gaps, gap: jax.Array, leader_speed: jax.Array) -> jax.Array:
-        return idm.acceleration(
-            side.follower_speed, gap, leader_speed, side.follower_desired, side.follower
-        )
-
-    whole = new.behind + length + new.ahead
-    behind_now = follower(new, whole, new.leader_speed)
-    behind_then = follower(new, new.behind, cars.speed)
-    left_now = follower(old, old.behind, cars.speed)
-    left_then = follower(old, old.behind + length + old.ahead, old.leader_speed)
-    gain = jnp.where(new.behind < jnp.inf, behind_then - behind_now, 0.0)
-    gain += jnp.where(old.behind < jnp.inf, left_then - left_now, 0.0)
-    gain = goes - stays + POLITENESS * gain
+    behind_then = lane_gaps.follows(new, new.behind, cars.speed)
+    gain = goes - stays + POLITENESS * _gain_behind(old, new, cars)
     must = _ends(cars.lanes, cars.lane_s, road_map)
     bound = -jnp.where(must, SAFE_BRAKING, POLITE_BRAKING)
     safe = (new.ahead > MIN_GAP) & (new.behind > MIN_GAP) & (goes > bound)
@@ -230,72 +188,13 @@ def judge(
     return gain, safe
 
 
-def _others(
-    agents: Agents, movers: Mover, desired: jax.Array, road_map: RoadMap, params: IDMParams
-) -> Others:
-    """Everybody, with how they drive; the ego counts as a car that drives at the limit at least."""
-    row, _ = changing(agents)
-    ego_limit = road_map.lane_speed_limit[jnp.maximum(movers.lane[-1], 0)]
-    ego_desired = jnp.maximum(ego_limit, movers.speed[-1])
-    model = jnp.append(agents.model, vehicles.CAR)
-    return Others(
-        mover=with_leaving(movers, agents),
-        desired=jnp.concatenate([desired, ego_desired[None], desired[row]]),
-        driver=vehicles.driver(jnp.concatenate([model, agents.model[row]]), params),
-    )
-
-
-def gaps(
-    lanes: jax.Array,
-    s: jax.Array,
-    length: jax.Array,
-    itself: jax.Array,
-    others: Others,
-    road_map: RoadMap,
-) -> Gaps:
-    """Whom a place on a lane has before and behind it; those exactly beside count as behind.
-
-    Args:
-      lanes: (M, 3) int32, the lane and the two after it.
-      s: (M,) m on the first.
-      length: (M,) m, of the vehicle that is or would be there.
-      itself: (M,) int32, row of that vehicle among the others.
-      others: everybody.
-      road_map: the map.
-    """
-    movers = others.mover
-    is_other = jnp.arange(movers.lane.shape[0]) != itself[:, None]
-    lane, other_s = jnp.where(is_other, movers.lane[None, :], -1), movers.s[None, :]
-    to_next = (road_map.lane_length[jnp.maximum(lanes[:, 0], 0)] - s)[:, None]
-    to_third = to_next + road_map.lane_length[jnp.maximum(lanes[:, 1], 0)][:, None]
-    on_first = (lane == lanes[:, :1]) & (lane >= 0)
-    on_next = (lane == lanes[:, 1:2]) & (lane >= 0)
-    on_third = (lane == lanes[:, 2:]) & (lane >= 0)
-    offset = other_s - s[:, None]
-    ahead = jnp.where(on_first & (offset > 0.0), offset, FAR)
-    ahead = jnp.minimum(ahead, jnp.where(on_next, to_next + other_s, FAR))
-    ahead = jnp.minimum(ahead, jnp.where(on_third, to_third + other_s, FAR))
-    # From the middle of the place to that of whoever drives up to it.
-    arrives = (movers.next_lane[None, :] == lanes[:, :1]) & (lane >= 0)
-    until = s[:, None] + movers.entry[None, :] + movers.half_length[None, :]
-    behind = jnp.where(on_first & (offset <= 0.0), -offset, jnp.where(arrives, until, FAR))
-    half = 0.5 * length[:, None] + movers.half_length[None, :]
-    ahead, behind = ahead - half, behind - half
-    nearest, follows = ahead.min(axis=1), behind.min(axis=1)
-
-    # Of whoever is nearest: no search by index, which costs more than all the rest.
-    def of(is_it: jax.Array, values: jax.Array | float) -> jax.Array:
-        return jnp.where(is_it, values, 0.0).max(axis=1)
-
-    leads, comes = ahead == nearest[:, None], behind == follows[:, None]
-    return Gaps(
-        ahead=jnp.where(nearest < 0.5 * FAR, nearest, jnp.inf),
-        behind=jnp.where(follows < 0.5 * FAR, follows, jnp.inf),
-        leader_speed=of(leads, movers.speed),
-        follower_speed=of(comes, movers.speed),
-        follower_desired=of(comes, others.desired),
-        follower=others.driver.replace(
-            accel_max=of(comes, others.driver.accel_max),
-            comfort_brake=of(comes, others.driver.comfort_brake),
-        ),
-    )
+def _gain_behind(old: Gaps, new: Gaps, cars: Agents) -> jax.Array:
+    """(M,) m/s^2 that the old and the new follower gain together."""
+    whole = new.behind + cars.length + new.ahead
+    behind = lane_gaps.follows(new, new.behind, cars.speed)
+    behind = behind - lane_gaps.follows(new, whole, new.leader_speed)
+    whole = old.behind + cars.length + old.ahead
+    left = lane_gaps.follows(old, whole, old.leader_speed)
+    left = left - lane_gaps.follows(old, old.behind, cars.speed)
+    gain = jnp.where(jnp.isinf(new.behind), 0.0, behind)
+    return gain + jnp.where(jnp.isinf(old.behind), 0.0, left)
