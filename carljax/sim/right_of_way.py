@@ -94,7 +94,7 @@ def all_movers(
     half = 0.5 * agents.length
     ego_half = 0.5 * ego_length
     ego_left = road_map.lane_length[jnp.maximum(ego_place.lane, 0)] - ego_place.s
-    held = must_stop(agents, stop)
+    held = must_stop(agents, stop) & ~agents.is_lawless
     ego_stop = _next_line(
         jnp.maximum(ego_place.lane, 0),
         ego_place.next_lane,

@@ -106,14 +106,19 @@ def accelerations(
     road_map: RoadMap,
     params: IDMParams,
 ) -> jax.Array:
-    """(N,) m/s^2: the hardest braking that any leader, line or junction asks for."""
+    """(N,) m/s^2: the hardest braking that any leader, line or junction asks for.
+
+    The lawless mind only who is ahead of them in their lane, the ego not even there.
+    """
     desired = desired_speed(agents, road_map)
     drivers = vehicles.driver(agents.model, params)
     gap, leader_speed = leaders(agents, movers, road_map)
     change_gap, change_speed = lane_shift.leaders(agents, movers, road_map)
-    ego_gap = corridor_gap(agents, ego, ego_length)
-    line = jnp.where(must_stop(agents, stop), stop.distance - STOP_MARGIN, FAR)
-    gate = jnp.where(gated(agents, movers, road_map), movers.entry[:-1] - STOP_MARGIN, FAR)
+    minds = ~agents.is_lawless
+    ego_gap = jnp.where(minds, corridor_gap(agents, ego, ego_length), FAR)
+    line = jnp.where(minds & must_stop(agents, stop), stop.distance - STOP_MARGIN, FAR)
+    waits = minds & gated(agents, movers, road_map)
+    gate = jnp.where(waits, movers.entry[:-1] - STOP_MARGIN, FAR)
     lane_end = road_map.lane_end[planned_lane(agents, 0)] - agents.lane_s - 0.5 * agents.length
     dead_end = jnp.where(agents.lanes[:, 1] < 0, lane_end - STOP_MARGIN, FAR)
     still = jnp.minimum(jnp.minimum(line, gate), dead_end)
@@ -124,13 +129,15 @@ def accelerations(
     accel = jnp.minimum(respond(gap, leader_speed), respond(change_gap, change_speed))
     accel = jnp.minimum(accel, respond(ego_gap, ego.speed))
     accel = jnp.minimum(accel, respond(still, jnp.zeros_like(still)))
+    accel = jnp.where(agents.is_braking_hard, -params.brake_max, accel)
     return jnp.where(agents.valid, accel, 0.0)
 
 
 def desired_speed(agents: Agents, road_map: RoadMap) -> jax.Array:
-    """(N,) m/s: the limit, slower in bends and early enough before them."""
+    """(N,) m/s: the limit or what a scenario asks, slower in bends and early enough before them."""
     lane, following = planned_lane(agents, 0), planned_lane(agents, 1)
     cap = vehicles.speed_cap(agents.model)
+    cap = jnp.where(agents.cruise_speed > 0.0, agents.cruise_speed, cap)
     limit = jnp.minimum(road_map.lane_speed_limit[lane] * agents.desired_speed_frac, cap)
     here = jnp.minimum(limit, road_map.lane_curve_speed[lane])
     there = jnp.minimum(
@@ -138,7 +145,9 @@ def desired_speed(agents: Agents, road_map: RoadMap) -> jax.Array:
         road_map.lane_curve_speed[following],
     )
     left = jnp.maximum(road_map.lane_length[lane] - agents.lane_s, 0.0)
-    return jnp.maximum(jnp.minimum(here, jnp.sqrt(there**2 + 2 * CURVE_BRAKING * left)), 1.0)
+    legal = jnp.maximum(jnp.minimum(here, jnp.sqrt(there**2 + 2 * CURVE_BRAKING * left)), 1.0)
+    is_scripted = agents.is_lawless & (agents.cruise_speed > 0.0)
+    return jnp.where(is_scripted, agents.cruise_speed, legal)
 
 
 def leaders(agents: Agents, movers: Mover, road_map: RoadMap) -> tuple[jax.Array, jax.Array]:
@@ -158,7 +167,9 @@ def leaders(agents: Agents, movers: Mover, road_map: RoadMap) -> tuple[jax.Array
     gap = jnp.where(same & (ahead > 0.0), ahead, FAR)
     gap = jnp.minimum(gap, jnp.where(on_next, to_next + other_s, FAR))
     gap = jnp.minimum(gap, jnp.where(other == lanes[:, 2], to_third + other_s, FAR))
-    gap = jnp.where((other >= 0) & (gap > 0.0), gap - movers.half_length[None, :], FAR)
+    is_ego = (jnp.arange(movers.lane.shape[0]) == movers.lane.shape[0] - 1)[None, :]
+    seen = (other >= 0) & ~(is_ego & agents.is_lawless[:, None])
+    gap = jnp.where(seen & (gap > 0.0), gap - movers.half_length[None, :], FAR)
     nearest = gap.min(axis=1)
     # No search by index, which would cost more than all of the above.
     speed = jnp.where(gap == nearest[:, None], movers.speed, 0.0).max(axis=1)
