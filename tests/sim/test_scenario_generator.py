@@ -13,6 +13,7 @@ from carljax.sim.scenarios import generator, registry
 from carljax.sim.scenarios.generator import place_along
 from carljax.sim.scenarios.script import DRIVE_FLOW, DRIVE_MEET
 from carljax.sim.town import offsets
+from carljax.sim.types import KIND_NONE
 
 NUM_ROUTES, LENGTH = 200, 1000
 
@@ -78,14 +79,21 @@ def test_in_order_on_the_route_and_as_the_engine_expects_them(drawn):
 def test_who_holds_lights_or_waits_for_nobody_has_the_road_for_itself(drawn):
     num = 0
     for *_, found in drawn:
-        for i, one in enumerate(found):
-            drive = one.cars.drive[one.cars.model >= 0]
-            alone = one.held_junction >= 0 or np.isin(drive, (DRIVE_FLOW, DRIVE_MEET)).any()
-            num += bool(alone)
-            for other in found[:i] + found[i + 1 :]:
+        alone = [x for x in found if x.held_junction >= 0 or is_lawless(x).any()]
+        others = [x for x in found if not any(x is y for y in alone)]
+        num += len(alone)
+        for i, one in enumerate(alone):
+            for other in alone[:i]:
                 later, sooner = max(one.trigger_s, other.trigger_s), min(one.end_s, other.end_s)
-                assert not alone or later > sooner
+                assert later > sooner
+            for other in others:
+                for meet_s in other.others.meet_s[other.others.kind != KIND_NONE]:
+                    assert abs(meet_s - one.cars.meet_s[0]) >= 40.0
     assert num > NUM_ROUTES  # more than one a route
+
+
+def is_lawless(scenario):
+    return (scenario.cars.model >= 0) & np.isin(scenario.cars.drive, (DRIVE_FLOW, DRIVE_MEET))
 
 
 def test_held_junctions_lie_ahead_on_the_route(drawn):

@@ -17,10 +17,12 @@ from carljax.sim.scenarios import registry
 from carljax.sim.scenarios.script import DRIVE_LEGAL, Scenario
 from carljax.sim.scenarios.site import Site
 from carljax.sim.town import Offsets, Town
+from carljax.sim.types import KIND_NONE
 
 SPACING = 100.0  # m. source: paper, Scenario Generation
 START_ROOM = 20  # route points before the first trigger, so that the ego has set off. source: ours
 END_ROOM = 60  # route points after the last trigger, in which it can play. source: ours
+JUNCTION_SIZE = 40.0  # m of route around a meeting that belong to its junction. source: ours
 # Kinds that few places suit: they need a certain junction, and a certain way through it.
 RARE = frozenset(
     (
@@ -83,15 +85,25 @@ def _try(kind: str, site: Site, rng: np.random.Generator) -> Scenario | None:
 
 
 def clash(one: Scenario, other: Scenario) -> bool:
-    """Whether two scenarios play at once while one holds lights or has cars that wait for nobody.
+    """Whether one scenario gets in another's way.
 
-    So none holds a junction that another uses, and no stream drives into what another does.
+    Two that hold lights or have cars that wait for nobody never play at once, and nobody stands or
+    crosses where such cars meet the ego.
     """
-    together = one.trigger_s <= other.end_s and other.trigger_s <= one.end_s
-    return bool(together and (_needs_road(one) or _needs_road(other)))
+    alone, other_alone = _needs_road(one), _needs_road(other)
+    if alone and other_alone:
+        return bool(one.trigger_s <= other.end_s and other.trigger_s <= one.end_s)
+    return (alone and _stands_at(other, one)) or (other_alone and _stands_at(one, other))
 
 
 def _needs_road(scenario: Scenario) -> bool:
     cars = scenario.cars
     is_lawless = (cars.model >= 0) & (cars.drive != DRIVE_LEGAL)
     return bool(scenario.held_junction >= 0 or is_lawless.any())
+
+
+def _stands_at(scenario: Scenario, other: Scenario) -> bool:
+    """Whether an actor off the lanes is to meet the ego near where the other's cars do."""
+    meet_s = scenario.others.meet_s[scenario.others.kind != KIND_NONE]
+    junction_s = other.cars.meet_s[other.cars.model >= 0]
+    return bool((np.abs(meet_s[:, None] - junction_s) < JUNCTION_SIZE).any())
