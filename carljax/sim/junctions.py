@@ -13,6 +13,13 @@ from carljax.sim.types import STOP_LIGHT, STOP_NONE, STOP_SIGN, STOP_YIELD
 # What lane a owes lane b of the same junction.
 FREE, CONFLICT, CONFLICT_YIELD, CONFLICT_PRIORITY = 0, 1, 2, 3
 
+# How two lanes of a junction meet, other than by crossing: they end on one lane, begin on one.
+MERGE, FORK = 1, 2
+
+# `RoadMap.lane_meeting`: bits 0-1 what a lane owes, 2-3 MERGE and FORK, 4-17 and 18-31 where on it
+# the other lane is too near, from and to, in steps of 1/32 m (up to 512 m).
+MEETING_STEPS, MEETING_MASK = 32.0, (1 << 14) - 1
+
 CLEARANCE = (
     2.6  # m between lane centres at which two cars can't pass. source: ours, car width + 0.7 m
 )
@@ -22,17 +29,35 @@ TURN_YAW = np.deg2rad(35.0)  # beyond it a lane turns. source: CaRL's route gene
 
 @dataclasses.dataclass(frozen=True)
 class JunctionTable:
-    """Fields as in `RoadMap`: junction (K,), slot (K,), conflict (K, J), fork, yield_s (K,)."""
+    """Fields as in `RoadMap`: junction, slot, yield_s (K,), meeting (K, J); and what it is made of.
+
+    Attributes:
+      conflict: (K, J) uint8, what each lane owes each lane of its junction.
+      relation: (K, J) uint8, bits MERGE and FORK.
+      enter, leave: (K, J) m along the lane, where it comes too near to the other and where it has
+        left it; equal where it never does.
+    """
 
     junction: np.ndarray
     slot: np.ndarray
-    conflict: np.ndarray
-    fork: np.ndarray
     yield_s: np.ndarray
+    conflict: np.ndarray
+    relation: np.ndarray
+    enter: np.ndarray
+    leave: np.ndarray
+
+    @property
+    def meeting(self) -> np.ndarray:
+        """(K, J) uint32, all of it in one number each: one look-up on the device, not four."""
+        enter = np.floor(self.enter * MEETING_STEPS).astype(np.uint32)
+        leave = np.ceil(self.leave * MEETING_STEPS).astype(np.uint32)
+        most = np.uint32(MEETING_MASK)
+        codes = self.conflict.astype(np.uint32) | self.relation.astype(np.uint32) << 2
+        return codes | np.minimum(enter, most) << 4 | np.minimum(leave, most) << 18
 
 
 def build(network: RoadNetwork, table: LaneTable) -> JunctionTable:
-    """Finds conflicts between the lanes of each junction.
+    """Finds where the lanes of each junction meet and who goes first.
 
     Lanes that leave the same lane don't conflict: traffic on them follows one another until they
     part.
@@ -40,39 +65,58 @@ def build(network: RoadNetwork, table: LaneTable) -> JunctionTable:
     num_lanes = len(table.length)
     ids = junction_ids(table)
     junction = np.array([-1 if name is None else ids[name] for name in table.junction])
-    fork = _forks(table)
-    slot = np.zeros(num_lanes, int)
     members = [np.flatnonzero(junction == i) for i in range(len(ids))]
-    size = max([len(m) for m in members], default=1)
-    conflict = np.zeros((num_lanes, max(size, 1)), np.uint8)
-    yield_s = np.full(num_lanes, np.inf)
+    shape = (num_lanes, max([len(m) for m in members], default=1))
+    found = JunctionTable(
+        junction=junction,
+        slot=np.zeros(num_lanes, int),
+        yield_s=np.full(num_lanes, np.inf),
+        conflict=np.zeros(shape, np.uint8),
+        relation=np.zeros(shape, np.uint8),
+        enter=np.zeros(shape),
+        leave=np.zeros(shape),
+    )
     for name, i in ids.items():
-        rows = members[i]
-        slot[rows] = np.arange(len(rows))
+        rows = members[i].tolist()
+        found.slot[rows] = np.arange(len(rows))
         priority = set(network.junctions[name].priority) if name in network.junctions else set()
-        for a in rows.tolist():
-            for b in rows.tolist():
-                if a != b and fork[a] != fork[b] and _meet(table, a, b):
-                    conflict[a, slot[b]] = _owes(network, table, a, b, priority)
-                    if _waits_for(table, a, b, int(conflict[a, slot[b]])):
-                        yield_s[a] = min(yield_s[a], _meeting_s(table, a, b))
-    return JunctionTable(junction, slot, conflict, fork, yield_s)
+        for a in rows:
+            for b in rows:
+                if a != b:
+                    _fill(found, network, table, a, b, priority)
+    return found
+
+
+def _fill(
+    found: JunctionTable,
+    network: RoadNetwork,
+    table: LaneTable,
+    a: int,
+    b: int,
+    priority: set[tuple[str, str]],
+) -> None:
+    """Enters what lane a has to know of lane b."""
+    near = np.flatnonzero(_near(table, a, b))
+    if len(near) == 0:
+        return
+    spacing = table.length[a] / (table.num_points[a] - 1)
+    place = (a, found.slot[b])
+    # The lanes come near somewhere between two points.
+    found.enter[place] = max(near[0] - 1, 0) * spacing
+    found.leave[place] = min((near[-1] + 1) * spacing, table.length[a])
+    ends = set(table.successors[a][table.successors[a] >= 0]) & set(table.successors[b])
+    begins = set(table.predecessors[a]) & set(table.predecessors[b])
+    found.relation[place] = (MERGE if ends else 0) | (FORK if begins else 0)
+    if begins:
+        return
+    found.conflict[place] = _owes(network, table, a, b, priority)
+    if _waits_for(table, a, b, int(found.conflict[place])):
+        found.yield_s[a] = min(found.yield_s[a], near[0] * spacing)
 
 
 def junction_ids(table: LaneTable) -> dict[str, int]:
     """Running index of each junction that has driving lanes, by its id in the file."""
     return {name: i for i, name in enumerate(sorted({j for j in table.junction if j is not None}))}
-
-
-def _forks(table: LaneTable) -> np.ndarray:
-    """Equal numbers for lanes that share a predecessor; lanes without one get their own."""
-    return np.array(
-        [pred[0] if pred else -1 - lane for lane, pred in enumerate(table.predecessors)]
-    )
-
-
-def _meet(table: LaneTable, a: int, b: int) -> bool:
-    return bool(_near(table, a, b).any())
 
 
 def _near(table: LaneTable, a: int, b: int) -> np.ndarray:
@@ -81,11 +125,6 @@ def _near(table: LaneTable, a: int, b: int) -> np.ndarray:
     gap = np.hypot(*(xyz_a[:, None, :2] - xyz_b[None, :, :2]).transpose(2, 0, 1))
     level = np.abs(xyz_a[:, None, 2] - xyz_b[None, :, 2]) < 3.0
     return ((gap < CLEARANCE) & level).any(axis=1)
-
-
-def _meeting_s(table: LaneTable, a: int, b: int) -> float:
-    """Arc length on lane a where it first comes too near to lane b, m."""
-    return float(np.argmax(_near(table, a, b)) * table.length[a] / (table.num_points[a] - 1))
 
 
 def _waits_for(table: LaneTable, a: int, b: int, owes: int) -> bool:

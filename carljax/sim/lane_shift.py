@@ -70,6 +70,7 @@ def with_leaving(movers: Mover, agents: Agents) -> Mover:
         speed=agents.speed[row],
         half_length=0.5 * agents.length[row],
         can_go=jnp.zeros(lane.shape, bool),
+        is_queued=jnp.zeros(lane.shape, bool),
     )
     return jax.tree.map(lambda a, b: jnp.concatenate([a, b]), movers, more)
 

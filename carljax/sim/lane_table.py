@@ -14,6 +14,7 @@ LATERAL_ACCEL = 2.5  # m/s^2 in bends. source: ours, a comfortable value for tra
 DEFAULT_SPEED_LIMIT = (
     50.0 / 3.6
 )  # m/s, for lanes of files that give none: built-up areas in most of Europe
+CURVE_BRAKING = 1.5  # m/s^2 towards a bend. source: ours
 MIN_LENGTH = 1e-3  # m
 DRIVABLE_WIDTH = 2.5  # m, less is too narrow for a car. source: ours
 
@@ -61,6 +62,7 @@ class LaneTable:
     point_xyz: np.ndarray
     point_yaw: np.ndarray
     point_width: np.ndarray
+    point_speed: np.ndarray
     point_lane: np.ndarray
 
     def place(self, raw: int, distance: float) -> Place:
@@ -106,7 +108,7 @@ def build(network: RoadNetwork) -> LaneTable:
         num_points=num_points,
         start=np.concatenate([[0], np.cumsum(num_points)[:-1]]),
         speed_limit=np.array([lanes[c[0]].speed_limit or DEFAULT_SPEED_LIMIT for c in chains]),
-        curve_speed=np.array([_curve_speed(yaw, size) for _, yaw, _, size in resampled]),
+        curve_speed=np.array([_curve_speed(yaw, size).min() for _, yaw, _, size in resampled]),
         successors=_successors(network, chains, raw_lane),
         predecessors=[sorted({int(raw_lane[p]) for p in lanes[c[0]].predecessors}) for c in chains],
         junction=[lanes[c[0]].junction for c in chains],
@@ -116,6 +118,7 @@ def build(network: RoadNetwork) -> LaneTable:
         point_xyz=np.concatenate([xyz for xyz, _, _, _ in resampled]),
         point_yaw=np.concatenate([yaw for _, yaw, _, _ in resampled]),
         point_width=np.concatenate([width for _, _, width, _ in resampled]),
+        point_speed=np.concatenate([_speed_profile(yaw, size) for _, yaw, _, size in resampled]),
         point_lane=np.repeat(np.arange(len(chains)), num_points),
     )
 
@@ -196,12 +199,23 @@ def _end(chain: list[int], lanes: tuple[Lane, ...], resampled: tuple[np.ndarray,
     return float(length) * int(wide[-1]) / (len(width) - 1)
 
 
-def _curve_speed(yaw: np.ndarray, length: float) -> float:
+def _curve_speed(yaw: np.ndarray, length: float) -> np.ndarray:
+    """(P - 1,) m/s, comfortable between each two points."""
     turn = np.abs(np.diff(np.unwrap(yaw)))
     if len(turn) >= 3:  # over 3 m, so that a kink between two pieces is no hairpin
-        turn = np.convolve(turn, np.ones(3) / 3, mode="valid")
-    curvature = max(float(turn.max()) / max(length / (len(yaw) - 1), 0.1), 1e-4)
-    return float(np.sqrt(LATERAL_ACCEL / curvature))
+        turn = np.convolve(np.pad(turn, 1, mode="edge"), np.ones(3) / 3, mode="valid")
+    curvature = np.maximum(turn / max(length / (len(yaw) - 1), 0.1), 1e-4)
+    return np.sqrt(LATERAL_ACCEL / curvature)
+
+
+def _speed_profile(yaw: np.ndarray, length: float) -> np.ndarray:
+    """(P,) m/s from which `CURVE_BRAKING` is enough for every bend that follows."""
+    between = _curve_speed(yaw, length)
+    speed = np.minimum(np.append(between, between[-1]), np.append(between[0], between))
+    spacing = length / (len(yaw) - 1)
+    for k in range(len(speed) - 2, -1, -1):
+        speed[k] = min(speed[k], np.sqrt(speed[k + 1] ** 2 + 2 * CURVE_BRAKING * spacing))
+    return speed
 
 
 def _successors(network: RoadNetwork, chains: list[list[int]], raw_lane: np.ndarray) -> np.ndarray:

@@ -78,6 +78,7 @@ def nobody(num: int) -> Agents:
         signals=jnp.zeros(num, jnp.int32),
         lanes=jnp.full((num, 3), -1, jnp.int32),
         lane_s=zeros,
+        past_lane=jnp.full(num, -1, jnp.int32),
         desired_speed_frac=zeros,
         has_stopped=false,
         wait_s=zeros,

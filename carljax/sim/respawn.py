@@ -68,6 +68,7 @@ def respawn(
             width=jnp.where(moves, width, agents.width),
             lanes=jnp.where(moves[:, None], lanes, agents.lanes),
             lane_s=jnp.where(moves, s, agents.lane_s),
+            past_lane=jnp.where(moves, -1, agents.past_lane),
             speed=jnp.where(moves, speed, agents.speed),
             accel=jnp.where(moves, 0.0, agents.accel),
             wait_s=jnp.where(moves, 0.0, agents.wait_s),

@@ -1,4 +1,4 @@
-"""Right of way: stop lines, lights, stop signs, and who enters a junction first."""
+"""Stop lines: lights and signs; and what drivers see of one another."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ import jax.numpy as jnp
 from flax import struct
 
 from carljax.sim import lights
-from carljax.sim.junctions import CONFLICT, CONFLICT_YIELD, FREE
 from carljax.sim.road_map import RoadMap
 from carljax.sim.types import (
     LIGHT_GREEN,
@@ -19,12 +18,11 @@ from carljax.sim.types import (
     LightClock,
 )
 
+FAR = 1e3  # m, a gap that changes nothing
 BRAKING = 3.0  # m/s^2 at which a driver still stops for yellow. source: ours, a firm stop
-GATE_RANGE = 40.0  # m before a junction at which others are looked at. source: ours
-GAP_TIME = 4.0  # s of gap taken in traffic that has priority. source: HCM critical gaps, 4 to 7 s
-PATIENCE = (
-    8.0  # s at rest after which nobody waits for a car that doesn't move itself. source: ours
-)
+CLEARED = 0.3  # s of yellow that are left when the line is passed. source: ours
+QUEUED, SETTING_OFF = 1.0, 0.3  # m/s, m/s^2, less of both is standing in a queue. source: ours
+SETS_OFF = 1.5  # m/s^2 of a car that goes at yellow. source: ours
 
 
 class Mover(struct.PyTreeNode):
@@ -37,6 +35,7 @@ class Mover(struct.PyTreeNode):
       speed: m/s.
       half_length: m.
       can_go: bool, no red light or unmet stop sign keeps it from `next_lane`.
+      is_queued: bool, stands and doesn't set off.
     """
 
     lane: jax.Array
@@ -46,6 +45,7 @@ class Mover(struct.PyTreeNode):
     speed: jax.Array
     half_length: jax.Array
     can_go: jax.Array
+    is_queued: jax.Array
 
 
 class EgoPlace(struct.PyTreeNode):
@@ -63,11 +63,41 @@ class StopAhead(struct.PyTreeNode):
       distance: m from its front bumper.
       kind: int32 STOP_*.
       light: int32 LIGHT_*, LIGHT_GREEN where there is no light.
+      yellow_left: s until the light turns red, if it is yellow.
     """
 
     distance: jax.Array
     kind: jax.Array
     light: jax.Array
+    yellow_left: jax.Array
+
+
+class Ahead(struct.PyTreeNode):
+    """The plan of each agent, (N, 3).
+
+    Attributes:
+      lane: int32, its lanes; row 0 where the plan has ended.
+      exists: bool.
+      begin: m from its middle to the beginning of each; negative for the lane it is on.
+      length: m.
+      in_junction: bool, False where the plan has ended.
+    """
+
+    lane: jax.Array
+    exists: jax.Array
+    begin: jax.Array
+    length: jax.Array
+    in_junction: jax.Array
+
+
+def ahead_of(agents: Agents, road_map: RoadMap) -> Ahead:
+    """Lays the lanes of each agent's plan one behind the other."""
+    exists = agents.lanes >= 0
+    lane = jnp.maximum(agents.lanes, 0)
+    length = road_map.lane_length[lane]
+    first = length[:, 0] - agents.lane_s
+    begin = jnp.stack([-agents.lane_s, first, first + length[:, 1]], axis=1)
+    return Ahead(lane, exists, begin, length, road_map.lane_in_junction[lane] & exists)
 
 
 def planned_lane(agents: Agents, number: int) -> jax.Array:
@@ -95,13 +125,9 @@ def all_movers(
     ego_half = 0.5 * ego_length
     ego_left = road_map.lane_length[jnp.maximum(ego_place.lane, 0)] - ego_place.s
     held = must_stop(agents, stop) & ~agents.is_lawless
-    ego_stop = _next_line(
-        jnp.maximum(ego_place.lane, 0),
-        ego_place.next_lane,
-        ego_place.s + ego_half,
-        road_map,
-        clock,
-    )
+    ego_lanes = jnp.stack([ego_place.lane, ego_place.next_lane])
+    ego_begin = jnp.stack([-ego_place.s, ego_left]) - ego_half
+    ego_stop = _first_line(jnp.maximum(ego_lanes, 0), ego_lanes >= 0, ego_begin, road_map, clock)
     room = ego_stop.distance > ego.speed**2 / (2 * BRAKING)
     ego_held = (ego_stop.kind == STOP_LIGHT) & (ego_stop.light != LIGHT_GREEN) & room
 
@@ -116,31 +142,40 @@ def all_movers(
         speed=with_ego(agents.speed, ego.speed),
         half_length=with_ego(half, ego_half),
         can_go=with_ego(~held, ~ego_held),
+        is_queued=with_ego(
+            (agents.speed < QUEUED) & (agents.accel < SETTING_OFF),
+            (ego.speed < QUEUED) & (ego.accel < SETTING_OFF),
+        ),
     )
 
 
 def stop_ahead(agents: Agents, road_map: RoadMap, clock: LightClock) -> StopAhead:
-    """The stop line on the lane an agent is on or on the one it will take next."""
-    front = agents.lane_s + 0.5 * agents.length
-    return _next_line(planned_lane(agents, 0), agents.lanes[:, 1], front, road_map, clock)
+    """The first stop line ahead on the lanes of an agent's plan."""
+    plan = ahead_of(agents, road_map)
+    front = 0.5 * agents.length[:, None]
+    return _first_line(plan.lane, plan.exists, plan.begin - front, road_map, clock)
 
 
-def _next_line(
-    lane: jax.Array, next_lane: jax.Array, front: jax.Array, road_map: RoadMap, clock: LightClock
+def _first_line(
+    lane: jax.Array, exists: jax.Array, begin: jax.Array, road_map: RoadMap, clock: LightClock
 ) -> StopAhead:
-    """The stop line ahead of a front bumper at arc length `front`; next_lane may be -1."""
-    following = jnp.where(next_lane >= 0, next_lane, lane)
-    here = road_map.lane_stop_s[lane] - front
-    there = road_map.lane_length[lane] + road_map.lane_stop_s[following] - front
-    ahead = (road_map.lane_stop_kind[lane] > 0) & (here > -0.5)
-    kind_there = jnp.where(next_lane >= 0, road_map.lane_stop_kind[following], 0)
-    governing = jnp.where(ahead, lane, following)
-    light = jnp.maximum(road_map.lane_light[governing], 0)
-    colour = lights.colour(light, clock, road_map)
+    """The stop line ahead of front bumpers on lanes (..., n) that begin so many metres ahead."""
+    distance = begin + road_map.lane_stop_s[lane]
+    holds = exists & (road_map.lane_stop_kind[lane] > 0) & (distance > -0.5)
+    first = jnp.argmax(holds, axis=-1)[..., None]
+
+    def pick(values: jax.Array) -> jax.Array:
+        return jnp.take_along_axis(values, first, axis=-1)[..., 0]
+
+    holds, governing = pick(holds), pick(lane)
+    light = road_map.lane_light[governing]
+    has_light = holds & (light >= 0)
+    light = jnp.maximum(light, 0)
     return StopAhead(
-        distance=jnp.where(ahead, here, there),
-        kind=jnp.where(ahead, road_map.lane_stop_kind[lane], kind_there),
-        light=jnp.where(road_map.lane_light[governing] >= 0, colour, LIGHT_GREEN),
+        distance=jnp.where(holds, pick(distance), FAR),
+        kind=jnp.where(holds, road_map.lane_stop_kind[governing], 0),
+        light=jnp.where(has_light, lights.colour(light, clock, road_map), LIGHT_GREEN),
+        yellow_left=lights.yellow_left_of(light, clock, road_map),
     )
 
 
@@ -148,10 +183,12 @@ def must_stop(agents: Agents, stop: StopAhead) -> jax.Array:
     """(N,) bool: a red light, a yellow one with room to stop, or a stop sign not yet honoured.
 
     Whoever waited through the green for a gap goes at yellow: else a turn across a stream of
-    oncoming traffic is never made.
+    oncoming traffic is never made. Nobody goes who would pass the line too late.
     """
     room = stop.distance > agents.speed**2 / (2 * BRAKING)
-    stops_at_yellow = (stop.light != LIGHT_GREEN) & room & ~agents.has_stopped
+    drives = jnp.sqrt(agents.speed**2 + 2 * SETS_OFF * jnp.maximum(stop.distance, 0.0))
+    late = (drives - agents.speed) / SETS_OFF > stop.yellow_left - CLEARED
+    stops_at_yellow = (stop.light != LIGHT_GREEN) & ((room & ~agents.has_stopped) | late)
     red = (stop.kind == STOP_LIGHT) & ((stop.light == LIGHT_RED) | stops_at_yellow)
     sign = (stop.kind == STOP_SIGN) & ~agents.has_stopped
     return (red | sign) & (stop.distance > -0.5)
@@ -167,38 +204,3 @@ def has_stopped(agents: Agents, stop: StopAhead, speed: jax.Array) -> jax.Array:
     waits = halts & (stop.light == LIGHT_GREEN)
     at_light = (stop.kind == STOP_LIGHT) & (agents.has_stopped | waits)
     return (at_sign | (at_light & (stop.light != LIGHT_RED))) & (stop.distance < 4.0)
-
-
-def gated(agents: Agents, movers: Mover, road_map: RoadMap) -> jax.Array:
-    """(N,) bool: others go first into the junction that an agent is about to enter.
-
-    Nobody enters while a conflicting lane is occupied or while another car's front is on its way
-    into it. Whoever has priority and is near goes first; among equals, whoever arrives first.
-    """
-    following = planned_lane(agents, 1)
-    entry = movers.entry[:-1]
-    enters = road_map.lane_in_junction[following] & (agents.lanes[:, 1] >= 0)
-    enters &= (entry > -1.0) & (entry < GATE_RANGE)
-    owes_inside = _owes(following, movers.lane, road_map)
-    owes = _owes(following, movers.next_lane, road_map)
-    arrival = jnp.maximum(movers.entry, 0.0) / jnp.maximum(movers.speed, 2.0)
-    coming = movers.can_go & (arrival < GAP_TIME)
-    entering = (movers.entry <= -1.0)[None, :]  # its centre, and so its lane, will follow
-    order = jnp.arange(movers.lane.shape[0])
-    mine, mine_order = arrival[:-1, None], order[:-1, None]
-    earlier = (arrival[None, :] < mine) | ((arrival[None, :] == mine) & (order < mine_order))
-    # Two that wait for one another would wait for ever.
-    stuck = (agents.wait_s > PATIENCE)[:, None] & (movers.speed < 0.5)[None, :]
-    waits = (owes == CONFLICT_YIELD) | ((owes == CONFLICT) & earlier)
-    waits |= (owes != FREE) & entering
-    waits &= coming[None, :] & ~stuck
-    return enters & ((owes_inside != FREE) | waits).any(axis=1)
-
-
-def _owes(lane: jax.Array, other: jax.Array, road_map: RoadMap) -> jax.Array:
-    """(N, N + 1) uint8: what each agent's lane owes the lane of every other car."""
-    seen = jnp.maximum(other, 0)
-    same = road_map.lane_junction[lane][:, None] == road_map.lane_junction[seen][None, :]
-    same &= (other >= 0)[None, :] & road_map.lane_in_junction[lane][:, None]
-    owes = road_map.lane_conflict[lane[:, None], road_map.lane_slot[seen][None, :]]
-    return jnp.where(same, owes, jnp.uint8(FREE))

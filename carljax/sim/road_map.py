@@ -41,9 +41,8 @@ class RoadMap(struct.PyTreeNode):
       lane_in_junction: (K,) bool.
       lane_junction: (K,) int32, running index of its junction, -1 outside.
       lane_slot: (K,) int32, place among the lanes of its junction, 0 outside.
-      lane_conflict: (K, J) uint8 over the slots of the same junction: FREE or one
-        of the CONFLICT codes of `junctions`.
-      lane_fork: (K,) int32, equal for lanes that leave the same lane.
+      lane_meeting: (K, J) uint32 over the slots of the same junction: who goes first, and where on
+        the lane the other one is too near (`junctions.MEETING_STEPS`).
       lane_yield_s: (K,) m along it where it comes near the first lane that it has to mind at its
         junction: one it owes, or an equal one without lights; infinity where there is none.
       lane_signal: (K,) int32, SIGNAL_* bit shown by those who turn on it, 0 where it does not turn.
@@ -52,6 +51,7 @@ class RoadMap(struct.PyTreeNode):
       lane_light: (K,) int32, row in the light table or -1.
       lane_town: (K,) int32.
       point_xy: (P, 2) m; point_z: (P,) m; point_yaw: (P,) rad; point_width: (P,) m.
+      point_speed: (P,) m/s, comfortable there in view of all bends of the lane from there on.
       point_lane: (P,) int32.
       point_left, point_right: (P,) int32, the point of the lane beside to which traffic may change;
         -1 where there is none, in junctions and across solid lines.
@@ -82,8 +82,7 @@ class RoadMap(struct.PyTreeNode):
     lane_in_junction: jax.Array
     lane_junction: jax.Array
     lane_slot: jax.Array
-    lane_conflict: jax.Array
-    lane_fork: jax.Array
+    lane_meeting: jax.Array
     lane_yield_s: jax.Array
     lane_signal: jax.Array
     lane_stop_s: jax.Array
@@ -94,6 +93,7 @@ class RoadMap(struct.PyTreeNode):
     point_z: jax.Array
     point_yaw: jax.Array
     point_width: jax.Array
+    point_speed: jax.Array
     point_lane: jax.Array
     point_left: jax.Array
     point_right: jax.Array
@@ -188,6 +188,19 @@ def nearest_lane(road_map: RoadMap, town: jax.Array, xy: jax.Array) -> LaneQuery
         z=road_map.point_z[point],
         in_junction=road_map.lane_in_junction[lane] & found,
     )
+
+
+def row_at(road_map: RoadMap, lane: jax.Array, s: jax.Array) -> jax.Array:
+    """(...) int32, row in the point table of the point nearest to places on lanes.
+
+    Args:
+      road_map: the map.
+      lane: (...) int32, rows of the lane table, not negative.
+      s: (...) m; clipped to the lane.
+    """
+    last = road_map.lane_num_points[lane] - 1
+    number = jnp.round(s * last / road_map.lane_length[lane]).astype(jnp.int32)
+    return road_map.lane_start[lane] + jnp.clip(number, 0, last)
 
 
 class Pose(struct.PyTreeNode):

@@ -50,8 +50,6 @@ def _lane_arrays(towns: Sequence[Town]) -> dict[str, np.ndarray]:
     forks = max(t.lanes.successors.shape[1] for t in towns)
     for town, first in zip(towns, offsets(towns), strict=True):
         table, cross, light = town.lanes, town.junctions, town.lights
-        # Forks are named by their first lane; lanes without one got negative names of their own.
-        fork = np.where(cross.fork >= 0, cross.fork + first.lane, cross.fork - first.lane)
         arrays = {
             "lane_start": table.start + first.point,
             "lane_num_points": table.num_points,
@@ -63,8 +61,7 @@ def _lane_arrays(towns: Sequence[Town]) -> dict[str, np.ndarray]:
             "lane_in_junction": cross.junction >= 0,
             "lane_junction": _shift(cross.junction, first.junction),
             "lane_slot": cross.slot,
-            "lane_conflict": _widen(cross.conflict, slots, 0),
-            "lane_fork": fork,
+            "lane_meeting": _widen(cross.meeting, slots, 0),
             "lane_yield_s": cross.yield_s,
             "lane_signal": _turn_signals(town),
             "lane_stop_s": table.stop_s,
@@ -75,6 +72,7 @@ def _lane_arrays(towns: Sequence[Town]) -> dict[str, np.ndarray]:
             "point_z": table.point_xyz[:, 2],
             "point_yaw": table.point_yaw,
             "point_width": table.point_width,
+            "point_speed": table.point_speed,
             "point_lane": table.point_lane + first.lane,
             "point_left": _shift(town.neighbours.left, first.point),
             "point_right": _shift(town.neighbours.right, first.point),

@@ -73,9 +73,10 @@ class Agents(struct.PyTreeNode):
       signals: (N,) int32, SIGNAL_* and DOOR_* bits.
       lanes: (N, 3) int32, the lane it is on and the two it will take next; -1 past a dead end.
       lane_s: (N,) m, arc length on lanes[:, 0].
+      past_lane: (N,) int32, the lane it was on before, -1 if unknown: its tail may still be there.
       desired_speed_frac: (N,) this driver's free speed as a fraction of the limit.
       has_stopped: (N,) bool, has come to rest at the stop sign, or at the green light, ahead.
-      wait_s: (N,) s, time at rest.
+      wait_s: (N,) s since it came to rest, until it drives on.
       lateral: (N,) m, offset from the lane's centre, positive to its left; a lane change brings it
         to 0.
       from_lane: (N,) int32, the lane that it still leaves during a lane change, else -1.
@@ -99,6 +100,7 @@ class Agents(struct.PyTreeNode):
     signals: jax.Array
     lanes: jax.Array
     lane_s: jax.Array
+    past_lane: jax.Array
     desired_speed_frac: jax.Array
     has_stopped: jax.Array
     wait_s: jax.Array

@@ -167,7 +167,7 @@ def pair():
     return both, [road_map_builder.build([t]) for t in both], road_map_builder.build(both)
 
 
-# Which table each index points into; -1 (and in lane_fork what is below) stays apart.
+# Which table each index points into; -1 stays apart.
 POINTS_TO = {
     "lane_start": "point_lane",
     "lane_successors": "lane_length",
@@ -186,13 +186,13 @@ def test_towns_together_are_each_alone_with_rows_shifted(pair, name, number):
     mine, rows = np.asarray(getattr(alone[number], name)), np.asarray(getattr(together, name))
     before = sum(len(getattr(m, name)) for m in alone[:number])
     rows = rows[before : before + len(mine)]
-    if name in ("lane_successors", "lane_conflict"):  # padded to the wider town
+    if name in ("lane_successors", "lane_meeting"):  # padded to the wider town
         pad = rows[:, mine.shape[1] :]
         assert (pad == (-1 if name == "lane_successors" else 0)).all()
         rows = rows[:, : mine.shape[1]]
     if name == "lane_town":
         assert (rows == number).all()
-    elif name in ("lane_fork", "lane_junction"):  # names: what is equal must stay so
+    elif name in ("lane_junction",):  # names: what is equal must stay so
         same = mine[:, None] == mine[None, :]
         np.testing.assert_array_equal(rows[:, None] == rows[None, :], same)
         np.testing.assert_array_equal(rows < 0, mine < 0)
@@ -203,12 +203,11 @@ def test_towns_together_are_each_alone_with_rows_shifted(pair, name, number):
         np.testing.assert_array_equal(rows, mine)
 
 
-def test_names_of_forks_and_junctions_are_not_shared_between_towns(pair):
+def test_names_of_junctions_are_not_shared_between_towns(pair):
     both, _, together = pair
-    num = len(both[0].lanes.length)
-    for values in (together.lane_fork, together.lane_junction):
-        first, second = (set(x.tolist()) - {-1} for x in (values[:num], values[num:]))
-        assert first.isdisjoint(second)
+    num, values = len(both[0].lanes.length), together.lane_junction
+    first, second = (set(x.tolist()) - {-1} for x in (values[:num], values[num:]))
+    assert first.isdisjoint(second)
 
 
 @pytest.mark.parametrize("number", [0, 1])

@@ -153,7 +153,7 @@ def random_cars(table, num, rng):
 
 
 def leader_oracle(table, agents, i):
-    """Nearest car on the plan of car i, or beside it where its lane has just left another."""
+    """Nearest car on the plan of car i."""
     plan, s = agents.lanes[i], float(agents.lane_s[i])
     best = (np.inf, 0.0)
     begins = -s  # of the lane under consideration, as seen from the car
@@ -164,9 +164,7 @@ def leader_oracle(table, agents, i):
             if j == i or agents.kind[j] == KIND_NONE:
                 continue
             theirs, at = int(agents.lanes[j, 0]), float(agents.lane_s[j])
-            parted = k < 2 and at < 9.0 and (k == 1 or s < 9.0)
-            from_one = set(table.predecessors[theirs]) & set(table.predecessors[lane])
-            if theirs != lane and not (parted and from_one):
+            if theirs != lane:
                 continue
             if k == 0 and at <= s:
                 continue

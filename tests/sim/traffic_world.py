@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from small_world import LIMIT, approach, crossing, inner, leaving, road
 
-from carljax.sim import geometry, lights, population, right_of_way, traffic
+from carljax.sim import drivers, geometry, lights, population, priority, right_of_way, traffic
 from carljax.sim import road_map_builder as builder
 from carljax.sim import town as towns_module
 from carljax.sim.idm import IDMParams
@@ -124,6 +124,7 @@ def cars(world, *specs):
         "kind": np.full(SLOTS, KIND_NONE, np.int32),
         "has_stopped": np.zeros(SLOTS, bool),
         "wait_s": np.zeros(SLOTS),
+        "past_lane": np.full(SLOTS, -1, np.int32),
     }
     for slot, spec in enumerate(specs):
         values["kind"][slot] = KIND_VEHICLE
@@ -169,25 +170,40 @@ def enters_at(path, slot, lane):
     return int(np.argmax(gone)) if gone.any() else 10**6
 
 
-leaders_jit = jax.jit(
-    lambda agents, stop, ego, place, road_map: traffic.leaders(
-        agents,
-        right_of_way.all_movers(
-            agents, stop, ego, f32(EGO_LENGTH), place, road_map, lights.clock(f32(0.0), 0)
-        ),
-        road_map,
+def _pairs(agents, movers, road_map):
+    """Everybody where lanes meet: all pairs, and what each agent looks at."""
+    free = drivers.free_speed(agents, road_map)
+    focus = priority.focus_of(agents, road_map, free.limit)
+    others = priority.crossers(agents, movers, road_map, free.limit)
+    return priority.pairs(agents, focus, others, road_map), focus
+
+
+@jax.jit
+def leaders_jit(agents, stop, ego, place, road_map):
+    clock = lights.clock(f32(0.0), 0)
+    movers = right_of_way.all_movers(agents, stop, ego, f32(EGO_LENGTH), place, road_map, clock)
+    return drivers.leaders(drivers.lane_gaps(agents, movers, road_map), agents, movers)
+
+
+@jax.jit
+def joined_jit(agents, road_map):
+    """(N, N + 1) gaps to cars on lanes that part from or join an agent's own."""
+    clock = lights.clock(f32(0.0), 0)
+    stop = right_of_way.stop_ahead(agents, road_map, clock)
+    movers = right_of_way.all_movers(
+        agents, stop, make_ego(), f32(EGO_LENGTH), ego_place(), road_map, clock
     )
-)
+    return priority.joined_gaps(_pairs(agents, movers, road_map)[0])
+
+
 stop_ahead_jit = jax.jit(right_of_way.stop_ahead)
 
 
-gated_jit = jax.jit(
-    lambda agents, stop, ego, place, road_map, time: right_of_way.gated(
-        agents,
-        right_of_way.all_movers(agents, stop, ego, f32(EGO_LENGTH), place, road_map, time),
-        road_map,
-    )
-)
+@jax.jit
+def gated_jit(agents, stop, ego, place, road_map, clock):
+    movers = right_of_way.all_movers(agents, stop, ego, f32(EGO_LENGTH), place, road_map, clock)
+    pair, focus = _pairs(agents, movers, road_map)
+    return priority.gated(pair, movers.can_go) & (focus.lane >= 0)
 
 
 def is_gated(world, agents, time=0.0, ego=None, place=None):

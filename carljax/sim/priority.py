@@ -1,0 +1,325 @@
+"""Where lanes meet: who goes first, and whom to follow from one lane to the other.
+
+For each two lanes of a junction it is known where on either the other one is too near
+(`junctions`). A car that comes to a junction compares when it would be on such a stretch with when
+others would be on theirs, and waits at the junction's entry if it has to give way. In the junction
+it stops before a stretch on which another stands, and follows those with whom its lane begins or
+ends. Nobody enters who could not leave again.
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+from carljax.sim.junctions import (
+    CONFLICT,
+    CONFLICT_YIELD,
+    FORK,
+    FREE,
+    MEETING_MASK,
+    MEETING_STEPS,
+    MERGE,
+)
+from carljax.sim.right_of_way import BRAKING, Mover, ahead_of
+from carljax.sim.road_map import RoadMap
+from carljax.sim.types import Agents
+
+FAR = 1e3  # m, a gap that changes nothing
+NOTICE = 12.0  # m, and the way to stop gently: from there on a junction is looked at. source: ours
+GENTLE_BRAKING = 2.0  # m/s^2. source: ours
+ENTERED = 1.0  # m into the junction from which on a car will not wait at its entry. source: ours
+ACCEL = 1.5  # m/s^2 at which others, and the car itself, are taken to drive off. source: ours
+SLOWEST = 1.0  # m/s of others that are taken to go on. source: ours
+MARGIN = 1.2  # s between two cars at one place. source: ours
+LEAST_MARGIN = 0.3  # s, after long waits. source: ours
+PATIENCE = 8.0  # s at rest after which nobody waits for a car that doesn't move. source: ours
+FOLLOWS = 0.5  # s of headway given to a car before which an agent joins. source: ours
+SHORT = 12.0  # m; nobody waits for room on shorter lanes, such as in roundabouts. source: ours
+ROOM_GAP = 2.0  # m kept to it at rest. source: IDM's gap at rest
+
+
+class Crossers(struct.PyTreeNode):
+    """Agents and, last, the ego, where lanes meet; all (M,), M = N + 1.
+
+    Attributes:
+      lane: int32, the junction's lane that it is on or has not wholly left, else the one it will
+        take next; -1 for none.
+      s: m of its middle along that lane, negative before its beginning, beyond its end after it.
+      speed: m/s.
+      top_speed: m/s, no faster than that on it.
+      half_length: m.
+      wait_s: s at rest.
+      is_lawless: bool, stops for nobody.
+    """
+
+    lane: jax.Array
+    s: jax.Array
+    speed: jax.Array
+    top_speed: jax.Array
+    half_length: jax.Array
+    wait_s: jax.Array
+    is_lawless: jax.Array
+
+
+class Focus(struct.PyTreeNode):
+    """What each agent looks at, (N,): the junction it is in or soon in the next one.
+
+    Attributes:
+      lane: int32, of its plan; -1 for none.
+      s: m of its middle along that lane, negative before its beginning.
+      front: m of its front bumper, likewise.
+      length: m, of that lane.
+      top_speed: m/s on it.
+      can_wait: bool, is before it and on a lane on which there is room to wait.
+    """
+
+    lane: jax.Array
+    s: jax.Array
+    front: jax.Array
+    length: jax.Array
+    can_wait: jax.Array
+    top_speed: jax.Array
+
+
+class Meeting(struct.PyTreeNode):
+    """What lanes have to do with lanes: owes int32; merges, forks bool; enter, leave m."""
+
+    owes: jax.Array
+    merges: jax.Array
+    forks: jax.Array
+    enter: jax.Array
+    leave: jax.Array
+
+
+class Pairs(struct.PyTreeNode):
+    """Every agent's focus (rows) against every crosser (columns), (N, M)."""
+
+    mine: Meeting
+    theirs: Meeting
+    focus: Focus
+    others: Crossers
+    speed: jax.Array
+    wait_s: jax.Array
+    half_length: jax.Array
+
+
+def crossers(agents: Agents, movers: Mover, road_map: RoadMap, top_speed: jax.Array) -> Crossers:
+    """Everybody as others see them at junctions.
+
+    Args:
+      agents: (N,) vehicles.
+      movers: (N + 1,) the same and the ego.
+      road_map: the map.
+      top_speed: (N,) m/s, free speeds.
+    """
+    lane, following = jnp.maximum(movers.lane, 0), jnp.maximum(movers.next_lane, 0)
+    past = jnp.append(jnp.where(agents.valid, agents.past_lane, -1), -1)
+    is_in = (movers.lane >= 0) & road_map.lane_in_junction[lane]
+    is_out = (past >= 0) & (movers.s < movers.half_length)
+    is_out &= road_map.lane_in_junction[jnp.maximum(past, 0)] & ~is_in
+    comes = (movers.next_lane >= 0) & road_map.lane_in_junction[following]
+    way = jnp.where(is_in, lane, jnp.where(is_out, past, jnp.where(comes, following, -1)))
+    before = movers.s - road_map.lane_length[lane]
+    after = movers.s + road_map.lane_length[jnp.maximum(past, 0)]
+    bend = road_map.lane_curve_speed[jnp.maximum(way, 0)]
+    # The ego may be as fast as it likes.
+    return Crossers(
+        lane=way,
+        s=jnp.where(is_in, movers.s, jnp.where(is_out, after, before)),
+        speed=movers.speed,
+        top_speed=jnp.minimum(jnp.append(top_speed, 40.0), 1.2 * bend),
+        half_length=movers.half_length,
+        wait_s=jnp.append(agents.wait_s, 0.0),
+        is_lawless=jnp.append(agents.is_lawless, False),
+    )
+
+
+def focus_of(agents: Agents, road_map: RoadMap, top_speed: jax.Array) -> Focus:
+    """The junction of each agent's plan that matters to it now."""
+    plan = ahead_of(agents, road_map)
+    half = 0.5 * agents.length
+    nearby = plan.begin - half[:, None] < (NOTICE + agents.speed**2 / (2 * GENTLE_BRAKING))[:, None]
+    comes = plan.in_junction & nearby & (plan.begin > 0.0)
+    following = jnp.where(comes[:, 1], 1, 2)
+    is_in = plan.in_junction[:, 0]
+    begin = jnp.where(comes[:, 1], plan.begin[:, 1], plan.begin[:, 2])
+    near = begin - half < 4.0 + agents.speed**2 / (2 * BRAKING)
+    looks_on = comes[:, 1:].any(axis=1) & (~is_in | near)
+    number = jnp.where(looks_on, following, 0)[:, None]
+
+    def pick(values: jax.Array) -> jax.Array:
+        return jnp.take_along_axis(values, number, axis=1)[:, 0]
+
+    used = (is_in | looks_on) & agents.valid
+    lane, s = pick(plan.lane), -pick(plan.begin)
+    return Focus(
+        lane=jnp.where(used, lane, -1),
+        s=s,
+        front=s + half,
+        length=pick(plan.length),
+        can_wait=looks_on & ~is_in & (plan.length[:, 0] > SHORT),
+        top_speed=jnp.minimum(top_speed, road_map.lane_curve_speed[lane]),
+    )
+
+
+def pairs(agents: Agents, focus: Focus, others: Crossers, road_map: RoadMap) -> Pairs:
+    """Looks up how each focus meets each lane of others."""
+    return Pairs(
+        mine=_meeting(focus.lane[:, None], others.lane[None, :], road_map),
+        theirs=_meeting(others.lane[None, :], focus.lane[:, None], road_map),
+        focus=jax.tree.map(lambda x: x[:, None], focus),
+        others=jax.tree.map(lambda x: x[None, :], others),
+        speed=agents.speed[:, None],
+        wait_s=agents.wait_s[:, None],
+        half_length=0.5 * agents.length[:, None],
+    )
+
+
+def _meeting(lane: jax.Array, other: jax.Array, road_map: RoadMap) -> Meeting:
+    row, seen = jnp.maximum(lane, 0), jnp.maximum(other, 0)
+    same = (lane >= 0) & (other >= 0)
+    same &= road_map.lane_junction[row] == road_map.lane_junction[seen]
+    found = jnp.where(same, road_map.lane_meeting[row, road_map.lane_slot[seen]], jnp.uint32(0))
+    bits = found.astype(jnp.int32)
+
+    def metres(shift: int) -> jax.Array:
+        steps = jax.lax.shift_right_logical(bits, jnp.int32(shift)) & MEETING_MASK
+        return steps.astype(jnp.float32) * jnp.float32(1 / MEETING_STEPS)
+
+    relation = (bits >> 2) & 3
+    return Meeting(
+        owes=bits & 3,
+        merges=(relation & MERGE) > 0,
+        forks=(relation & FORK) > 0,
+        enter=metres(4),
+        leave=metres(18),
+    )
+
+
+def joined_gaps(pair: Pairs) -> jax.Array:
+    """(N, M) m, bumper gap to cars on lanes that begin or end with an agent's own, FAR elsewhere.
+
+    Where lanes part, to the one ahead until its tail is clear; where they join, to the one that is
+    nearer to where they end.
+    """
+    mine, theirs, focus, others = pair.mine, pair.theirs, pair.focus, pair.others
+    room = pair.half_length + others.half_length
+    parts = mine.forks & (others.s > focus.s) & (others.s - others.half_length < theirs.leave)
+    parts &= others.s > -others.half_length
+    gap = jnp.where(parts, others.s - focus.s - room, FAR)
+    return jnp.where(_joins(pair), _join_gap(pair) - room, gap)
+
+
+def _join_gap(pair: Pairs) -> jax.Array:
+    """How much farther an agent has to go to where the lanes join than the other, m."""
+    # Both lanes are left at the same place, so the stretches end there.
+    mine, theirs = pair.mine.leave - pair.focus.s, pair.theirs.leave - pair.others.s
+    return mine - theirs
+
+
+def _joins(pair: Pairs) -> jax.Array:
+    """The other car's front is where the lanes join, and it is ahead."""
+    there = pair.others.s + pair.others.half_length > pair.theirs.enter
+    return pair.mine.merges & there & (_join_gap(pair) > 0.0)
+
+
+def stretch_gaps(pair: Pairs) -> jax.Array:
+    """(N,) m from the front bumper to the first stretch on which another car is; FAR for none."""
+    theirs, focus, others = pair.theirs, pair.focus, pair.others
+    crosses = (pair.mine.leave > 0.0) & ~pair.mine.merges & ~pair.mine.forks
+    there = others.s + others.half_length > theirs.enter
+    there |= others.is_lawless & _collides(pair, MARGIN)
+    there &= others.s - others.half_length < theirs.leave
+    blocked = crosses & there & (focus.front < pair.mine.enter)
+    return jnp.where(blocked, pair.mine.enter - focus.front, FAR).min(axis=1)
+
+
+def has_room(focus: Focus, half_length: jax.Array, gaps: jax.Array, movers: Mover) -> jax.Array:
+    """(N,) bool: behind those who stand an agent would come to rest beyond the junction.
+
+    Those who drive between it and the first one that stands will stop there as well. On a short
+    lane between two junctions none of it is asked: cars that wait there for one another all around
+    a block or a roundabout would wait for ever.
+
+    Args:
+      focus: of each agent.
+      half_length: (N,) m.
+      gaps: (N, M) m to cars ahead on its plan, FAR to others.
+      movers: (M,) everybody.
+    """
+    to_queue = jnp.where(movers.is_queued, gaps, FAR).min(axis=1)
+    space = 2.0 * movers.half_length + ROOM_GAP
+    taken = jnp.where(gaps < to_queue[:, None], space, 0.0).sum(axis=1)
+    rests = focus.front + to_queue - taken - ROOM_GAP
+    is_free = (to_queue >= FAR) | (rests > focus.length + 2.0 * half_length)
+    return ~focus.can_wait | is_free
+
+
+def gated(pair: Pairs, may_go: jax.Array) -> jax.Array:
+    """(N,) bool: others go first into the junction that an agent is about to enter.
+
+    Args:
+      pair: of everybody.
+      may_go: (M,) bool, neither a light, a sign nor want of room keeps it from entering.
+    """
+    mine, theirs, focus, others = pair.mine, pair.theirs, pair.focus, pair.others
+    front = others.s + others.half_length
+    has_entered = front > ENTERED
+    there = (front > theirs.enter) & (others.s - others.half_length < theirs.leave)
+    # Two that wait for one another would wait for ever: the one that waited longest goes.
+    order = jnp.arange(others.s.shape[1])
+    first = (pair.wait_s > others.wait_s) | (
+        (pair.wait_s == others.wait_s) & (order[: pair.wait_s.shape[0], None] < order)
+    )
+    stands = (pair.wait_s > PATIENCE) & (others.speed < 0.5) & ~others.is_lawless
+    inside = has_entered & (others.s - others.half_length < theirs.leave) & ~_joins(pair)
+    inside &= (_leaves(pair) + 0.5 * MARGIN > _arrives(pair)) & (there | ~stands)
+    margin = jnp.clip(MARGIN * PATIENCE / (PATIENCE + pair.wait_s), LEAST_MARGIN, MARGIN)
+    yields = (mine.owes == CONFLICT_YIELD) | others.is_lawless
+    yields |= (mine.owes == CONFLICT) & _is_earlier(pair, order)
+    coming = ~has_entered & may_go[None, :] & yields & _collides(pair, margin)
+    waits = (mine.owes != FREE) & (inside | (coming & ~(stands & first)))
+    return waits.any(axis=1) & (focus.front[:, 0] < ENTERED)
+
+
+def _is_earlier(pair: Pairs, order: jax.Array) -> jax.Array:
+    """The other car arrives, or has arrived, before the agent."""
+    focus, others = pair.focus, pair.others
+    mine = jnp.maximum(-focus.front, 0.0) / jnp.maximum(pair.speed, 2.0) - pair.wait_s
+    other = jnp.maximum(-others.s - others.half_length, 0.0) / jnp.maximum(others.speed, 2.0)
+    other = other - others.wait_s
+    mine_order = order[: mine.shape[0], None]
+    return (other < mine) | ((other == mine) & (order < mine_order))
+
+
+def _collides(pair: Pairs, margin: jax.Array | float) -> jax.Array:
+    """An agent that goes now and another would be on their stretches within a margin of time."""
+    mine, theirs, focus, others = pair.mine, pair.theirs, pair.focus, pair.others
+    theirs_in = _time(theirs.enter - others.s - others.half_length, others.speed, others.top_speed)
+    out = mine.leave - focus.s + pair.half_length
+    # A car that ends on one lane with the other only has to be ahead of it.
+    out = jnp.where(mine.merges, out + FOLLOWS * others.speed, out)
+    mine_out = _time(out, pair.speed, focus.top_speed)
+    return (_arrives(pair) < _leaves(pair) + margin) & (theirs_in < mine_out + margin)
+
+
+def _arrives(pair: Pairs) -> jax.Array:
+    """(N, M) s until an agent comes to the stretch."""
+    to_go = pair.mine.enter - pair.focus.front
+    return _time(to_go, pair.speed, pair.focus.top_speed)
+
+
+def _leaves(pair: Pairs) -> jax.Array:
+    """(N, M) s until the other car has left the stretch if it goes on as now."""
+    others = pair.others
+    left = pair.theirs.leave - others.s + others.half_length
+    return jnp.maximum(left, 0.0) / jnp.maximum(others.speed, SLOWEST)
+
+
+def _time(distance: jax.Array, speed: jax.Array, top_speed: jax.Array) -> jax.Array:
+    """Seconds for a distance: with ACCEL from a speed, no faster than another."""
+    distance = jnp.maximum(distance, 0.0)
+    free = (jnp.sqrt(speed**2 + 2 * ACCEL * distance) - speed) / ACCEL
+    return jnp.maximum(free, distance / jnp.maximum(top_speed, SLOWEST))
