@@ -76,7 +76,9 @@ def route(*changes):
         for name, value in fields.items():
             if name in ("cars", "others"):
                 for column, entries in value.items():
-                    getattr(getattr(found, name), column)[i, : len(entries)] = entries
+                    values = np.asarray(entries)
+                    part = (i, *(slice(0, size) for size in values.shape))
+                    getattr(getattr(found, name), column)[part] = values
             else:
                 getattr(found, name)[i] = value
     return jax.tree.map(lambda x: jnp.asarray(x)[None], found)
