@@ -1,9 +1,10 @@
 """DynamicObjectCrossing: a pedestrian steps onto the road from behind an obstacle.
 
 A box stands at the kerb, and right behind it a pedestrian, who starts to cross when the ego is so
-near that at its present speed it would hit the pedestrian, and walks on to the other side. Sources:
-CARLA's scenario runner, `object_crash_vehicle`, for speed, places and the nearest start; the
-official routes, as the authors' generator draws from them, for distance, angle and side.
+near that at its present speed it would hit the pedestrian, and walks on to the other side. Where
+this would be in a junction it is behind it. Sources: CARLA's scenario runner,
+`object_crash_vehicle`, for speed, places and the nearest start; the official routes, as the
+authors' generator draws from them, for distance, angle and side.
 """
 
 from __future__ import annotations
@@ -35,9 +36,9 @@ def place(site: Site, rng: np.random.Generator) -> Scenario | None:
     distance = COMMON_DISTANCE if is_common else float(rng.uniform(*DISTANCE))
     angle = np.deg2rad(rng.uniform(*ANGLE))
     side = -1.0 if rng.uniform() < RIGHT_FRAC else 1.0
-    if site.trigger_s + distance + END > site.length:
+    where = placing.outside_junction(site, site.trigger_s + distance)
+    if where is None or site.route.s[where.index] + END > site.length:
         return None
-    where = site_module.place_at(site, site.trigger_s + distance)
     aside = placing.pavement(site, where, side)
     # The pedestrian comes towards the ego while crossing: so it stands that much farther.
     ahead = aside * np.tan(angle)
@@ -47,8 +48,8 @@ def place(site: Site, rng: np.random.Generator) -> Scenario | None:
             placing.beside(where, ahead - 0.5 * BOX - BEHIND, side * aside),
         ]
     )
-    scenario = site_module.blank(site, site.trigger_s + distance + END, TIMEOUT)
     meet_s = float(site.route.s[where.index])
+    scenario = site_module.blank(site, meet_s + END, TIMEOUT)
     walk = aside / np.cos(angle)
     others = scenario.others
     others.kind[:2] = KIND_PEDESTRIAN, KIND_STATIC

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from carljax.sim.respawn import VIEW_BACK, VIEW_FRONT, VIEW_SIDE
+from carljax.sim.scenarios import site as site_module
 from carljax.sim.scenarios.site import Place, Site
 
 SIGHT_SLACK = 2.0  # m; the ego is not always on its route's line. source: ours
@@ -36,6 +37,15 @@ def arm_s(site: Site, xy: np.ndarray) -> float:
     if len(unseen) == 0:
         return 0.0
     return max(0.0, float(site.route.s[unseen[-1]]) - ARM_AHEAD)
+
+
+def outside_junction(site: Site, s: float) -> Place | None:
+    """The first place on the route at an arc length or beyond it that is in no junction."""
+    begin = site_module.place_at(site, s).index
+    inside = np.asarray(site.route.in_junction[begin : int(site.route.num_points)])
+    if inside.all():
+        return None
+    return site_module.place_at(site, float(site.route.s[begin + int(np.argmin(inside))]))
 
 
 def beside(place: Place, ahead: float, left: float) -> np.ndarray:
