@@ -3,14 +3,26 @@
 The ego comes from the west along y = -1.75 and enters the crossing at x = -10, 80 m on its route.
 """
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
-from small_world import ARMS, approach, crossing, inner, leaving
+from small_world import (
+    ARMS,
+    approach,
+    arc,
+    crossing,
+    inner,
+    leaving,
+    link,
+    network,
+    straight,
+)
 
-from carljax.sim import route_assembly, town
+from carljax.sim import population, route_assembly, town
 from carljax.sim.lights import CLEARING_S
+from carljax.sim.road_network import Junction
 from carljax.sim.route_assembly import Segment
-from carljax.sim.scenarios import junction_flow, registry
+from carljax.sim.scenarios import actors, junction_flow, registry, script
 from carljax.sim.scenarios import site as site_module
 from carljax.sim.scenarios.script import DRIVE_FLOW, DRIVE_MEET
 from carljax.sim.scenarios.site import Site
@@ -81,14 +93,52 @@ def test_the_next_junction_is_where_the_route_goes_through_it(way, turn, length)
 
 def test_arms_and_ways_through_follow_the_lanes():
     lane = row(UNLIT, inner("east", "straight"))
-    assert site_module.arm(UNLIT, lane, 50.0) == (row(UNLIT, approach("east")),)
-    assert site_module.arm(UNLIT, lane, 500.0) == (row(UNLIT, approach("east")),)
+    assert site_module.arm(UNLIT, lane, 50.0, 3) == (row(UNLIT, approach("east")),)
+    assert site_module.arm(UNLIT, lane, 500.0, 3) == (row(UNLIT, approach("east")),)
     assert site_module.through(UNLIT, lane) == (lane, row(UNLIT, leaving("west")))
     lanes = [row(UNLIT, x) for x in (approach("east"), inner("east", "straight"))]
     path = site_module.way(UNLIT, lanes)
     assert path.length == pytest.approx(100.0)
     np.testing.assert_allclose(path.xy[:, 0], 90.0 - path.s, atol=1e-6)
     np.testing.assert_allclose(path.xy[:, 1], 1.75, atol=1e-6)
+
+
+def test_a_short_arm_goes_on_straight_through_the_junction_before():
+    # From x = -60 a road of 30 m, a junction of 10 m, a road of 20 m and the junction in question;
+    # into the first junction's exit there also leads a bend from the side.
+    lanes = [
+        straight((-60, 0), (-30, 0)),
+        straight((-30, 0), (-20, 0), junction="1"),
+        straight((-20, 0), (0, 0)),
+        straight((0, 0), (20, 0), junction="2"),
+        arc((-30, 10), -np.pi / 2, 10.0, np.pi / 2, junction="1"),
+    ]
+    junction_of = [Junction("1", (), (1, 4)), Junction("2", (), (3,))]
+    pairs = [(0, 1), (1, 2), (2, 3), (4, 2)]
+    there = town.from_network(network(link(lanes, pairs), junctions=junction_of))
+    road, through, last, lane = (row(there, x) for x in range(4))
+    for reach, most, wanted in (
+        (15.0, 3, (last,)),
+        (25.0, 3, (through, last)),
+        (31.0, 3, (road, through, last)),
+        (99.0, 3, (road, through, last)),
+        (99.0, 2, (through, last)),
+    ):
+        assert site_module.arm(there, lane, reach, most) == wanted
+
+
+def test_cars_keep_to_their_way_beyond_the_lanes_they_plan():
+    way_lanes = jnp.array([[4, 7, 2, 9, 5], [4, 7, 2, -1, -1], [4, 7, 2, 9, 5]], jnp.int32)
+    blank = script.nothing(1).cars
+    cars = population.nobody(3).replace(
+        lanes=jnp.array([[7, 2, 1], [7, 2, 1], [6, 3, 1]], jnp.int32)
+    )
+    found = actors.way_on(cars, blank.replace(lanes=way_lanes))
+    # The first goes on to 9; the second's way is known no further, the third is on no way.
+    np.testing.assert_array_equal(found, [[7, 2, 9], [7, 2, 1], [6, 3, 1]])
+    at_end = population.nobody(1).replace(lanes=jnp.array([[5, 3, 1]], jnp.int32))
+    found = actors.way_on(at_end, blank.replace(lanes=way_lanes[:1]))
+    np.testing.assert_array_equal(found, [[5, 3, 1]])
 
 
 def test_place_at_takes_the_nearest_point():
@@ -165,7 +215,8 @@ def test_a_stream_meets_an_ego_at_the_limit(kind, there, way, arm, speeds, meeti
         num = int(used.sum())
         assert num >= 2 and used[:num].all()
         lanes = [approach(arm), inner(arm, "straight"), leaving(ARMS[(ARMS.index(arm) + 2) % 4])]
-        assert (cars.lanes[:num] == [FIRST.lane + row(there, lane) for lane in lanes]).all()
+        way_lanes = [*(FIRST.lane + row(there, lane) for lane in lanes), -1, -1]
+        assert (cars.lanes[:num] == way_lanes).all()
         assert (cars.drive[:num] == DRIVE_FLOW).all() and cars.from_trigger[:num].all()
         speed = float(cars.speed[0])
         assert (cars.speed[:num] == cars.speed[0]).all() and speeds[0] <= speed <= speeds[1]

@@ -114,11 +114,22 @@ def car_start(script: ScriptedCars, road_map: RoadMap) -> Pose:
 
 def way(cars: Agents, script: ScriptedCars, road_map: RoadMap) -> jax.Array:
     """(n,) m that cars have come along their ways, from the beginning of lanes[0]; inf beyond."""
-    length = road_map.lane_length[jnp.maximum(script.lanes[:, :2], 0)]
-    begin = jnp.pad(jnp.cumsum(length, axis=1), ((0, 0), (1, 0)))  # (n, 3)
+    length = road_map.lane_length[jnp.maximum(script.lanes[:, :-1], 0)]
+    begin = jnp.pad(jnp.cumsum(length, axis=1), ((0, 0), (1, 0)))  # (n, WAY_LANES)
     here = (cars.lanes[:, :1] == script.lanes) & (script.lanes >= 0)
     came = jnp.where(here, begin + cars.lane_s[:, None], jnp.inf)
     return came.min(axis=1)
+
+
+def way_on(cars: Agents, script: ScriptedCars) -> jax.Array:
+    """(n, 3) int32, plans that follow the cars' ways as far as these go."""
+    here = (cars.lanes[:, :1] == script.lanes) & (script.lanes >= 0)
+    known = jnp.pad(script.lanes, ((0, 0), (0, 2)), constant_values=-1)
+    at = jnp.argmax(here, axis=1)[:, None] + jnp.arange(1, 3)
+    following = jnp.take_along_axis(known, at, axis=1)
+    is_known = here.any(axis=1, keepdims=True) & (following >= 0)
+    onward = jnp.where(is_known, following, cars.lanes[:, 1:])
+    return jnp.concatenate([cars.lanes[:, :1], onward], axis=1)
 
 
 def waiting(
@@ -177,7 +188,8 @@ def put_cars(
         width=width,
         kind=jnp.full_like(cars.kind, KIND_VEHICLE),
         model=script.model,
-        lanes=script.lanes,
+        lanes=script.lanes[:, :3],
+        past_lane=jnp.full_like(cars.past_lane, -1),
         lane_s=script.s,
         desired_speed_frac=jnp.ones_like(zero),
         has_stopped=jnp.zeros_like(starts),
@@ -215,6 +227,7 @@ def command_cars(
     adapts = (script.drive == DRIVE_MEET) & (left > COMMIT_S * script.speed) & (eta > 0.0)
     own = jnp.where(script.drive == DRIVE_MEET, cars.cruise_speed, script.speed)
     return cars.replace(
+        lanes=jnp.where(plays[:, None], way_on(cars, script), cars.lanes),
         cruise_speed=jnp.where(plays, jnp.where(adapts, timed, own), 0.0),
         is_lawless=plays & (script.drive != DRIVE_LEGAL),
         signals=jnp.where(cars.valid, cars.signals | script.signals, 0),

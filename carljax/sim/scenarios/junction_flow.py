@@ -15,7 +15,13 @@ import numpy as np
 
 from carljax.sim import junctions
 from carljax.sim.scenarios import site as site_module
-from carljax.sim.scenarios.script import DRIVE_FLOW, NUM_CARS, Scenario, ScriptedCars
+from carljax.sim.scenarios.script import (
+    DRIVE_FLOW,
+    NUM_CARS,
+    WAY_LANES,
+    Scenario,
+    ScriptedCars,
+)
 from carljax.sim.scenarios.site import RouteJunction, Site, Way
 from carljax.sim.vehicles import CAR
 
@@ -28,7 +34,7 @@ GAP_TO_GO = 6.2
 # m up the arm, nearer than which no car may appear: the policy sees 64 m aside, and ahead 78 m from
 # before the junction. source: paper, Observation
 OUT_OF_SIGHT = 65.0
-SHORTEST_ARM = 45.0  # m; a shorter arm brings its cars into sight too suddenly. source: ours
+SHORTEST_ARM = 58.0  # m; out of sight aside from the ego's road, with half a junction. source: ours
 ARM_CLEARANCE = 4.0  # m kept to an arm's beginning. source: ours
 FARTHEST_SINK = 90.0  # m beyond the junction, out of sight. source: ours
 # m from the trigger to the junction. source: ours
@@ -170,7 +176,7 @@ def _cross_way(site: Site, crossing: RouteJunction, lane: int) -> CrossWay | Non
     """The way through a lane of the junction, or None where its arm is short or they don't meet."""
     town = site.town
     length = town.lanes.length
-    before = site_module.arm(town, lane, 1.0)[-1:]
+    before = site_module.arm(town, lane, SHORTEST_ARM, WAY_LANES - 2)
     entry = float(length[list(before)].sum())
     if entry < SHORTEST_ARM:
         return None

@@ -17,6 +17,7 @@ from flax import struct
 
 NUM_CARS = 4  # actors of a scenario that drive on lanes
 NUM_OTHERS = 3  # actors that stand or move straight on: pedestrians, bicycles, obstacles, doors
+WAY_LANES = 5  # lanes of a car's way: a junction, both roads beside it and as much again
 NUM_PATCHES = 3  # stretches of disturbed control
 
 # How a car of a scenario drives.
@@ -26,11 +27,11 @@ DRIVE_MEET = 2  # likewise, but so as to be at `meet_lane_s` when the ego is at 
 
 
 class ScriptedCars(struct.PyTreeNode):
-    """Actors on lanes, L = NUM_CARS rows.
+    """Actors on lanes, L = NUM_CARS rows, W = WAY_LANES.
 
     Attributes:
       model: (L,) int32, row in the table of vehicle classes; -1 for no car.
-      lanes: (L, 3) int32, the lanes of its way, -1 pads.
+      lanes: (L, W) int32, the lanes of its way, -1 pads.
       s: (L,) m on the first of them, where it starts.
       speed: (L,) m/s, at the start and its free speed; 0 leaves it to the limit.
       drive: (L,) int32, DRIVE_*.
@@ -206,7 +207,7 @@ def nothing(num: int) -> Scenario:
         timeout_s=full(np.inf),
         cars=ScriptedCars(
             model=full(-1, cars, dtype=np.int32),
-            lanes=full(-1, cars, 3, dtype=np.int32),
+            lanes=full(-1, cars, WAY_LANES, dtype=np.int32),
             s=full(0, cars),
             speed=full(0, cars),
             drive=full(DRIVE_LEGAL, cars, dtype=np.int32),

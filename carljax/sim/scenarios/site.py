@@ -16,7 +16,7 @@ from carljax.sim import junctions
 from carljax.sim.junctions import FREE
 from carljax.sim.route import Route
 from carljax.sim.scenarios import script
-from carljax.sim.scenarios.script import Scenario
+from carljax.sim.scenarios.script import WAY_LANES, Scenario
 from carljax.sim.town import Offsets, Town
 
 LOOK_AHEAD = 150  # route points ahead of a site in which its junction is looked for. source: ours
@@ -180,26 +180,37 @@ def entering_lanes(town: Town, lanes: Iterable[int]) -> list[int]:
     ]
 
 
-def arm(town: Town, lane: int, reach: float) -> tuple[int, ...]:
-    """Lanes that lead up to a lane, in order of travel, back for `reach` m or to a junction.
+def arm(town: Town, lane: int, reach: float, most: int) -> tuple[int, ...]:
+    """Lanes that lead up to a lane of a junction, in order of travel.
 
-    Where several lanes lead up to one the lowest row is taken, so the arm is always the same.
+    Where it is shorter than wanted it goes on straight through the junctions before.
+
+    Args:
+      town: where.
+      lane: in a junction.
+      reach: m wanted.
+      most: lanes.
     """
     found: list[int] = []
     length = 0.0
-    here = lane
-    while length < reach:
-        before = [
-            row
-            for row in town.lanes.predecessors[here]
-            if town.junctions.junction[row] < 0 and row not in found
-        ]
-        if not before:
+    while length < reach and len(found) < most:
+        before = _straightest(town, found[0] if found else lane)
+        if before < 0 or before in found:
             break
-        here = before[0]
-        found.insert(0, here)
-        length += float(town.lanes.length[here])
+        found.insert(0, before)
+        length += float(town.lanes.length[before])
     return tuple(found)
+
+
+def _straightest(town: Town, lane: int) -> int:
+    """The lane that leads into another with the least turn, -1 where all of them turn."""
+    turns = {
+        row: abs(junctions.turn(town.lanes, row))
+        for row in town.lanes.predecessors[lane]
+        if town.junctions.junction[row] < 0
+        or abs(junctions.turn(town.lanes, row)) <= junctions.TURN_YAW
+    }
+    return min(turns, key=lambda row: (turns[row], row), default=-1)
 
 
 def through(town: Town, lane: int) -> tuple[int, ...]:
@@ -264,9 +275,9 @@ def light_of(town: Town, lanes: Iterable[int]) -> int:
 
 
 def shared_lanes(site: Site, lanes: Sequence[int]) -> np.ndarray:
-    """(3,) int32, up to three lanes as rows of the shared table, -1 pads."""
-    rows = np.full(3, -1, np.int32)
-    kept = list(lanes)[:3]
+    """(WAY_LANES,) int32, lanes as rows of the shared table, as many as fit, -1 pads."""
+    rows = np.full(WAY_LANES, -1, np.int32)
+    kept = list(lanes)[:WAY_LANES]
     rows[: len(kept)] = np.asarray(kept, int) + site.first.lane
     return rows
 
