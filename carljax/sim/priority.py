@@ -51,7 +51,7 @@ class Crossers(struct.PyTreeNode):
       top_speed: m/s, no faster than that on it.
       half_length: m.
       wait_s: s at rest.
-      is_lawless: bool, stops for nobody.
+      is_lawless: bool, drives and stops for nobody.
     """
 
     lane: jax.Array
@@ -132,7 +132,8 @@ def crossers(agents: Agents, movers: Mover, road_map: RoadMap, top_speed: jax.Ar
         top_speed=jnp.minimum(jnp.append(top_speed, 40.0), 1.2 * bend),
         half_length=movers.half_length,
         wait_s=jnp.append(agents.wait_s, 0.0),
-        is_lawless=jnp.append(agents.is_lawless, False),
+        # One that stands in a queue will not come: to wait for it could be to wait for ever.
+        is_lawless=jnp.append(agents.is_lawless, False) & ~movers.is_queued,
     )
 
 
