@@ -297,6 +297,7 @@ def take_away(agents: Agents, who: jax.Array) -> Agents:
     """Rows without some of them."""
     return agents.replace(
         kind=jnp.where(who, KIND_NONE, agents.kind),
+        speed=jnp.where(who, 0.0, agents.speed),
         is_lawless=agents.is_lawless & ~who,
         cruise_speed=jnp.where(who, 0.0, agents.cruise_speed),
     )

@@ -58,7 +58,7 @@ def place(site: Site, rng: np.random.Generator) -> Scenario | None:
     others.yaw[:2] = where.yaw - side * (np.pi / 2 + angle), where.yaw
     others.length[:2] = others.width[:2] = BODY, BOX
     others.speed[0] = SPEED
-    others.distance[0] = 2.0 * walk  # source: as CARLA, to the other side if both are alike
+    others.distance[0] = walk + placing.pavement(site, where, -side) / np.cos(angle)
     others.meet_s[:2] = meet_s
     others.start_time[0] = walk / SPEED
     others.start_distance[0] = START_DISTANCE

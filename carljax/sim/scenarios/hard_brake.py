@@ -15,7 +15,7 @@ import numpy as np
 from carljax.sim.respawn import VIEW_FRONT
 from carljax.sim.scenarios import placing
 from carljax.sim.scenarios import site as site_module
-from carljax.sim.scenarios.script import DRIVE_LEGAL, Scenario
+from carljax.sim.scenarios.script import DRIVE_LEGAL, WAY_LANES, Scenario
 from carljax.sim.scenarios.site import Site
 from carljax.sim.vehicles import CAR
 
@@ -56,10 +56,10 @@ def place(site: Site, rng: np.random.Generator) -> Scenario | None:
 
 
 def _lanes(site: Site, first: int, last: int) -> list[int] | None:
-    """The route's lanes between two of its points; None where it changes lanes or has over three.
+    """The route's lanes between two of its points; None where it changes lanes or has too many.
 
-    A car knows three lanes of its way, and would stand where it knows no more: if the route has
-    fewer there, it goes on as it likes.
+    A car plans three lanes ahead, and would stand where it knows no more: if the route has fewer
+    there, it goes on as it likes.
     """
     table = site.town.lanes
     lane = np.asarray(site.route.lane[first : last + 1]) - site.first.lane
@@ -67,4 +67,4 @@ def _lanes(site: Site, first: int, last: int) -> list[int] | None:
     follow = all(after in table.successors[before] for before, after in itertools.pairwise(ordered))
     while len(ordered) < 3 and table.successors[ordered[-1]].max() >= 0:
         ordered.append(int(table.successors[ordered[-1]].max()))
-    return ordered if follow and len(ordered) <= 3 else None
+    return ordered if follow and len(ordered) <= WAY_LANES else None

@@ -1,8 +1,8 @@
 """VehicleTurningRoute: behind a junction where the ego turns a bicycle crosses the road.
 
 The bicycle stands beside the road that the ego turns into, right behind the junction, and sets off
-across it when the ego is so near that at its present speed it would hit it. Source: CARLA's
-scenario runner, `object_crash_intersection`.
+across it, to the other side, when the ego is so near that at its present speed it would hit it.
+Source: CARLA's scenario runner, `object_crash_intersection`.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ def place(site: Site, rng: np.random.Generator) -> Scenario | None:
     others.length[0] = np.mean(CLASSES[BICYCLE].length)
     others.width[0] = np.mean(CLASSES[BICYCLE].width)
     others.speed[0] = SPEED
-    others.distance[0] = 2.0 * aside
+    others.distance[0] = aside + placing.pavement(site, where, -SIDE)
     others.meet_s[0] = site.route.s[where.index]
     others.start_time[0] = aside / SPEED
     others.start_distance[0] = START_DISTANCE
