@@ -196,6 +196,7 @@ class DrivingEnv(struct.PyTreeNode):
         )
         traffic_rows = respawn.respawn(
             population.rows(vehicles, rows.traffic),
+            population.rows(vehicles, rows.cars),
             ego,
             stretch.town,
             road_map,

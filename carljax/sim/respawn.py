@@ -17,6 +17,7 @@ SPAWN_GAP = 14.0  # m kept to other cars
 
 def respawn(
     agents: Agents,
+    others: Agents,
     ego: EgoState,
     town: jax.Array,
     road_map: RoadMap,
@@ -27,6 +28,7 @@ def respawn(
 
     Args:
       agents: (N,) agents.
+      others: vehicles of scenarios, whose places are taken too.
       ego: the ego.
       town: () int32.
       road_map: the map.
@@ -41,8 +43,7 @@ def respawn(
     pose = pose_at(road_map, jnp.maximum(lane, 0), s)
     seen = geometry.to_frame(pose.xy, ego.xy, ego.yaw)
     hidden = (seen[0] > VIEW_FRONT) | (seen[0] < -VIEW_BACK) | (jnp.abs(seen[1]) > VIEW_SIDE)
-    offset = agents.xy - pose.xy
-    clear = (~agents.valid | ((offset**2).sum(axis=1) > SPAWN_GAP**2)).all()
+    clear = _is_clear(agents, pose.xy) & _is_clear(others, pose.xy)
     away = ((agents.xy - ego.xy) ** 2).sum(axis=1)
     ended = (agents.lanes[:, 1] < 0) & _at_end(agents, road_map)
     relative = geometry.to_frame(agents.xy, ego.xy, ego.yaw)
@@ -78,6 +79,11 @@ def respawn(
         ),
         road_map,
     )
+
+
+def _is_clear(agents: Agents, xy: jax.Array) -> jax.Array:
+    """() bool: none of them is near a place (2,)."""
+    return (~agents.valid | (((agents.xy - xy) ** 2).sum(axis=1) > SPAWN_GAP**2)).all()
 
 
 def _at_end(agents: Agents, road_map: RoadMap) -> jax.Array:

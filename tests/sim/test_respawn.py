@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from small_world import road
 
-from carljax.sim import respawn, road_map_builder, spawn, town, traffic, vehicles
+from carljax.sim import population, respawn, road_map_builder, spawn, town, traffic, vehicles
 from carljax.sim.types import KIND_NONE, EgoState
 
 NUM_WORLDS, NUM_CARS = 300, 6
@@ -23,10 +23,10 @@ def make_ego(xy, yaw):
 
 respawn_all = jax.jit(
     jax.vmap(
-        lambda agents, ego, town, road_map, key: respawn.respawn(
-            agents, ego, town, road_map, key, spawn.CELL
+        lambda agents, others, ego, town, road_map, key: respawn.respawn(
+            agents, others, ego, town, road_map, key, spawn.CELL
         ),
-        in_axes=(0, 0, 0, None, 0),
+        in_axes=(0, 0, 0, 0, None, 0),
     )
 )
 initial_all = jax.jit(jax.vmap(traffic.initial, in_axes=(0, 0, 0, None, 0)))
@@ -55,9 +55,12 @@ def places_in(road_map, rng):
     return lane, rng.uniform(0, 1, lane.shape) * length[lane]
 
 
-def come_back(road_map, agents, ego, towns, seed=5):
+NOBODY = jax.tree.map(lambda x: jnp.stack([x] * NUM_WORLDS), population.nobody(1))
+
+
+def come_back(road_map, agents, ego, towns, seed=5, others=NOBODY):
     keys = jax.random.split(jax.random.key(seed), NUM_WORLDS)
-    return respawn_all(agents, ego, jnp.asarray(towns, jnp.int32), road_map, keys)
+    return respawn_all(agents, others, ego, jnp.asarray(towns, jnp.int32), road_map, keys)
 
 
 @pytest.fixture(scope="module")
@@ -120,6 +123,16 @@ def test_they_come_back_where_there_is_room(moved):
     for b, i in np.argwhere(changed(before, after)):
         others = before.xy[b][before.kind[b] != KIND_NONE]
         assert np.hypot(*(others - after.xy[b, i]).T).min() > 14.0
+
+
+def test_they_do_not_come_back_into_a_scenarios_car(moved, road_map):
+    _, ego, before, after = moved
+    there = changed(before, after)
+    who = there.argmax(axis=1)
+    xy = after.xy[np.arange(NUM_WORLDS), who] + [13.9 / np.sqrt(2)] * 2  # 14 m are kept
+    others = NOBODY.replace(xy=jnp.float32(xy[:, None]), kind=jnp.ones_like(NOBODY.kind))
+    again = come_back(road_map, before, ego, TOWNS, others=others)
+    assert there.any(axis=1).sum() > 50 and not changed(before, again)[there.any(axis=1)].any()
 
 
 def test_they_drive_on_along_the_lane_graph(moved):
