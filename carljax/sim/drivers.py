@@ -56,7 +56,8 @@ def accelerations(
     others = priority.crossers(agents, movers, road_map, free.limit)
     pair = priority.pairs(agents, focus, others, road_map)
     along = lane_gaps(agents, movers, road_map)
-    gap, leader_speed = leaders(jnp.minimum(along, priority.joined_gaps(pair)), agents, movers)
+    joined = jnp.where(agents.is_lawless[:, None], FAR, priority.joined_gaps(pair))
+    gap, leader_speed = leaders(jnp.minimum(along, joined), movers)
     half = 0.5 * agents.length
     room = priority.has_room(focus, half, along, movers)
     may_go = movers.can_go & jnp.append(room, True)
@@ -131,16 +132,13 @@ def lane_gaps(agents: Agents, movers: Mover, road_map: RoadMap) -> jax.Array:
     return jnp.where((other >= 0) & (gap < FAR), gap - room, FAR)
 
 
-def leaders(gaps: jax.Array, agents: Agents, movers: Mover) -> tuple[jax.Array, jax.Array]:
+def leaders(gaps: jax.Array, movers: Mover) -> tuple[jax.Array, jax.Array]:
     """Bumper gap to, and speed of, the nearest car ahead: (N,) m, (N,) m/s.
 
     Args:
       gaps: (N, M) m to everybody.
-      agents: (N,) vehicles; lawless drivers don't mind the ego.
-      movers: (M,) everybody, the ego last.
+      movers: (M,) everybody.
     """
-    is_ego = jnp.arange(movers.lane.shape[0]) == agents.length.shape[0]
-    gaps = jnp.where(agents.is_lawless[:, None] & is_ego, FAR, gaps)
     nearest = gaps.min(axis=1)
     # No search by index, which would cost more than all of the above.
     return nearest, jnp.where(gaps == nearest[:, None], movers.speed, 0.0).max(axis=1)

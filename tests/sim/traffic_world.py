@@ -182,7 +182,7 @@ def _pairs(agents, movers, road_map):
 def leaders_jit(agents, stop, ego, place, road_map):
     clock = lights.clock(f32(0.0), 0)
     movers = right_of_way.all_movers(agents, stop, ego, f32(EGO_LENGTH), place, road_map, clock)
-    return drivers.leaders(drivers.lane_gaps(agents, movers, road_map), agents, movers)
+    return drivers.leaders(drivers.lane_gaps(agents, movers, road_map), movers)
 
 
 @jax.jit
