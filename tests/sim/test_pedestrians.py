@@ -244,7 +244,7 @@ def test_hardly_anybody_is_struck(village, record_property):
     careful = ~walkers.is_reckless[:, 0]
     km = (bodies.speed.sum(axis=1) * DT / 1000.0)[careful].sum()
     rate = begins.any(axis=-1).sum(axis=1)[careful].sum() / km
-    record_property("careful pedestrians struck per km walked", rate)
+    record_property("careful pedestrians struck per km walked", float(rate))
     assert km > 4.0 and rate < 0.15
 
 
