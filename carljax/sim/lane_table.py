@@ -190,7 +190,11 @@ def _resample(lanes: list[Lane]) -> tuple[np.ndarray, np.ndarray, np.ndarray, fl
     return points, wrapped, np.interp(at, s, width), length
 
 
-def _end(chain: list[int], lanes: tuple[Lane, ...], resampled: tuple[np.ndarray, ...]) -> float:
+def _end(
+    chain: list[int],
+    lanes: tuple[Lane, ...],
+    resampled: tuple[np.ndarray, np.ndarray, np.ndarray, float],
+) -> float:
     """Where a lane that leads nowhere has become too narrow, m; else its length."""
     _, _, width, length = resampled
     wide = np.flatnonzero(width >= DRIVABLE_WIDTH)
