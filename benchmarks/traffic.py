@@ -256,9 +256,7 @@ def advance(road_map: RoadMap, spots: Spots, world: World) -> tuple[World, Tally
     )
     renewed = leave_dead_end(after, spots, road_map, key_spot)
     return (
-        World(
-            agents=renewed, time=world.time + DT, touching=touching, has_halted=halted, key=key
-        ),
+        World(agents=renewed, time=world.time + DT, touching=touching, has_halted=halted, key=key),
         tally,
     )
 

@@ -56,8 +56,7 @@ def accelerations(
     others = priority.crossers(agents, movers, road_map, free.limit)
     pair = priority.pairs(agents, focus, others, road_map)
     along = lane_gaps(agents, movers, road_map)
-    joined = jnp.where(agents.is_lawless[:, None], FAR, priority.joined_gaps(pair))
-    gap, leader_speed = leaders(jnp.minimum(along, joined), movers)
+    gap, leader_speed = leaders(jnp.minimum(along, priority.joined_gaps(pair)), movers)
     half = 0.5 * agents.length
     room = priority.has_room(focus, half, along, movers)
     may_go = movers.can_go & jnp.append(room, True)

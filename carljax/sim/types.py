@@ -83,7 +83,7 @@ class Agents(struct.PyTreeNode):
       from_s: (N,) m, arc length on that lane.
       cruise_speed: (N,) m/s, free speed that a scenario asks for; 0 leaves it to limit and temper.
       is_lawless: (N,) bool, a scenario's driver, who minds neither lights, signs, right of way nor
-        whoever crosses its way, only who is ahead in its lane, be it the ego.
+        whoever crosses its way, only who is or comes ahead in its lane, be it the ego.
       is_braking_hard: (N,) bool, a scenario makes it brake to a halt.
     """
 

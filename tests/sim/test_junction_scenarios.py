@@ -125,9 +125,9 @@ def test_the_stream_leaves_its_source_car_by_car_at_its_speed(kind, env, path):
         late.append(time[e, at] - delay[e, i])
         assert cars.lane_s[e, at, i] == pytest.approx(source[e, i], abs=0.01)
         plays = there[e, :, i] & (time[e] >= 0.0)
-        # Until the ego is there it is slower only to keep its distance, on its way to the junction
-        # and through it.
-        plays &= path.route_s[rows(kind)][e] < script(env, "meet_s")[rows(kind)][e, i]
+        # Until the ego comes ahead of it, it is slower only to keep its distance, on its way to the
+        # junction and through it.
+        plays &= path.route_s[rows(kind)][e] < script(env, "meet_s")[rows(kind)][e, i] - 15.0
         plays &= (cars.lanes[e, :, i, :1] == script(env, "lanes")[rows(kind)][e, i, :2]).any(axis=1)
         assert (cars.speed[e, plays, i] <= speed[e, i] + 0.05).all()
         assert (cars.speed[e, plays, i] > 0.6 * speed[e, i]).all()
@@ -188,7 +188,9 @@ def test_the_ambulance_runs_its_red_light_when_the_ego_comes(env, path):
             assert int(lights.colour(light, clock, road_map)) == LIGHT_RED
             assert cars.speed[e, enters] > 8.0
         came = np.where(inside, length[lanes[e, 0]] + cars.lane_s[e], -1.0)
-        if (came >= meet[e]).any():
+        # It may brake for an ego that turns into its road, at the last moment.
+        nearly = came >= meet[e] - 5.0
+        if nearly.any():
             ego = path.route_s[rows(RED)][e]
-            in_time += abs(int((came >= meet[e]).argmax()) - int((ego >= meet_s[e]).argmax())) <= 6
+            in_time += abs(int(nearly.argmax()) - int((ego >= meet_s[e]).argmax())) <= 8
     assert in_time >= 0.7 * NUM
