@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
+from carljax.sim.once import once
 from carljax.sim.right_of_way import BRAKING, FAR, ahead_of
 from carljax.sim.road_map import RoadMap, row_at
 from carljax.sim.types import Agents, EgoState
@@ -22,10 +23,11 @@ SIDE = 0.5  # m kept to either side. source: ours
 
 
 class Obstacles(struct.PyTreeNode):
-    """What may be in the way, (F,): valid; xy (F, 2) m, yaw rad, speed m/s, length, width m."""
+    """What may be in the way, (F,): valid bool; x, y m; yaw rad; speed m/s; length, width m."""
 
     valid: jax.Array
-    xy: jax.Array
+    x: jax.Array
+    y: jax.Array
     yaw: jax.Array
     speed: jax.Array
     length: jax.Array
@@ -43,7 +45,8 @@ def obstacles(others: Agents, ego: EgoState, ego_length: jax.Array) -> Obstacles
     moves = others.valid & (others.speed > 0.0)
     return Obstacles(
         valid=rows(jnp.ones((), bool), others.valid, moves),
-        xy=rows(ego.xy, others.xy, then),
+        x=rows(ego.xy[0], others.xy[:, 0], then[:, 0]),
+        y=rows(ego.xy[1], others.xy[:, 1], then[:, 1]),
         yaw=rows(ego.yaw, others.yaw, others.yaw),
         speed=rows(ego.speed, others.speed, others.speed),
         length=rows(ego_length, others.length, others.length),
@@ -66,19 +69,19 @@ def gaps(agents: Agents, seen: Obstacles, road_map: RoadMap) -> tuple[jax.Array,
     piece = points[:, 1:] - points[:, :-1]
     length = jnp.sqrt(jnp.maximum((piece**2).sum(axis=-1), 1e-6))
     cos, sin = piece[..., 0] / length, piece[..., 1] / length  # (N, P)
-    from_x = seen.xy[:, 0] - points[:, :-1, :1]  # (N, P, F)
-    from_y = seen.xy[:, 1] - points[:, :-1, 1:]
-    ahead = cos[..., None] * from_x + sin[..., None] * from_y
-    side = jnp.abs(cos[..., None] * from_y - sin[..., None] * from_x)
-    cos_seen, sin_seen = jnp.cos(seen.yaw), jnp.sin(seen.yaw)
-    cos_to = cos[..., None] * cos_seen + sin[..., None] * sin_seen
-    sin_to = jnp.abs(sin[..., None] * cos_seen - cos[..., None] * sin_seen)
+    pieces = (points[:, :-1, 0], points[:, :-1, 1], cos, sin, length, along[:, :-1])
+    from_x, from_y, cos, sin, length, along = (x[..., None] for x in once(pieces))
+    cos_seen, sin_seen, seen = once((jnp.cos(seen.yaw), jnp.sin(seen.yaw), seen))
+    x, y = seen.x - from_x, seen.y - from_y  # (N, P, F)
+    ahead, side = cos * x + sin * y, jnp.abs(cos * y - sin * x)
+    cos_to = cos * cos_seen + sin * sin_seen
+    sin_to = jnp.abs(sin * cos_seen - cos * sin_seen)
     half_along = 0.5 * (seen.length * jnp.abs(cos_to) + seen.width * sin_to)
     half_across = 0.5 * (seen.length * sin_to + seen.width * jnp.abs(cos_to))
     across = half_across + (0.5 * agents.width + SIDE)[:, None, None]
-    distance = along[:, :-1, None] + ahead
+    distance = along + ahead
     in_way = seen.valid & (side < across) & (distance > 0.3 * agents.length[:, None, None])
-    in_way &= (ahead > -0.5) & (ahead < length[..., None] + 0.5)
+    in_way &= (ahead > -0.5) & (ahead < length + 0.5)
     gap = distance - half_along - 0.5 * agents.length[:, None, None]
     gap = jnp.where(in_way, gap, FAR).reshape(agents.length.shape[0], -1)
     speed = (seen.speed * jnp.maximum(cos_to, 0.0)).reshape(gap.shape)

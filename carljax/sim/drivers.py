@@ -16,6 +16,7 @@ from carljax.sim import corridor, idm, lane_shift, priority, vehicles
 from carljax.sim.corridor import Obstacles
 from carljax.sim.idm import IDMParams
 from carljax.sim.lane_table import CURVE_BRAKING
+from carljax.sim.once import once
 from carljax.sim.right_of_way import FAR, Mover, StopAhead, ahead_of, must_stop
 from carljax.sim.road_map import RoadMap, row_at
 from carljax.sim.types import Agents
@@ -54,13 +55,15 @@ def accelerations(
     """
     focus = priority.focus_of(agents, road_map, free.limit)
     others = priority.crossers(agents, movers, road_map, free.limit)
+    focus = once(focus)
+    others, movers = once((others, movers))
     pair = priority.pairs(agents, focus, others, road_map)
     along = lane_gaps(agents, movers, road_map)
     gap, leader_speed = leaders(jnp.minimum(along, priority.joined_gaps(pair)), movers)
     half = 0.5 * agents.length
     room = priority.has_room(focus, half, along, movers)
     may_go = movers.can_go & jnp.append(room, True)
-    may_go |= others.is_lawless
+    may_go = once(may_go | others.is_lawless)
     waits = priority.gated(pair, may_go) | (~room & (focus.front < priority.ENTERED))
     waits &= focus.lane >= 0
     lane_end = road_map.lane_end[jnp.maximum(agents.lanes[:, 0], 0)] - agents.lane_s - half

@@ -16,9 +16,10 @@ FREE, CONFLICT, CONFLICT_YIELD, CONFLICT_PRIORITY = 0, 1, 2, 3
 # How two lanes of a junction meet, other than by crossing: they end on one lane, begin on one.
 MERGE, FORK = 1, 2
 
-# `RoadMap.lane_meeting`: bits 0-1 what a lane owes, 2-3 MERGE and FORK, 4-17 and 18-31 where on it
-# the other lane is too near, from and to, in steps of 1/32 m (up to 512 m).
-MEETING_STEPS, MEETING_MASK = 32.0, (1 << 14) - 1
+# `RoadMap.lane_meeting`, in steps of 1/4 m (up to 256 m). The first number: bits 0-1 what a lane
+# owes the other, 2-3 MERGE and FORK, 4-13 and 14-23 from where to where on it the other lane is too
+# near. The second: bits 0-11 and 12-23 the same on the other lane. 24 bits are exact in float32.
+MEETING_STEPS, MEETING_MASK = 4.0, (1 << 10) - 1
 
 CLEARANCE = (
     2.6  # m between lane centres at which two cars can't pass. source: ours, car width + 0.7 m
@@ -48,12 +49,16 @@ class JunctionTable:
 
     @property
     def meeting(self) -> np.ndarray:
-        """(K, J) uint32, all of it in one number each: one look-up on the device, not four."""
-        enter = np.floor(self.enter * MEETING_STEPS).astype(np.uint32)
-        leave = np.ceil(self.leave * MEETING_STEPS).astype(np.uint32)
-        most = np.uint32(MEETING_MASK)
-        codes = self.conflict.astype(np.uint32) | self.relation.astype(np.uint32) << 2
-        return codes | np.minimum(enter, most) << 4 | np.minimum(leave, most) << 18
+        """(K, 2, J) float32, all of it as whole numbers of 24 bits; see `MEETING_STEPS`."""
+        enter = np.minimum(np.floor(self.enter * MEETING_STEPS), MEETING_MASK).astype(int)
+        leave = np.minimum(np.ceil(self.leave * MEETING_STEPS), MEETING_MASK).astype(int)
+        mine = self.conflict.astype(int) | self.relation.astype(int) << 2 | enter << 4 | leave << 14
+        both = np.stack([mine, np.zeros_like(mine)], axis=1)
+        for rows in (np.flatnonzero(self.junction == i) for i in np.unique(self.junction)):
+            if self.junction[rows[0]] >= 0:  # rows in the order of their slots
+                there = (enter | leave << 12)[rows, : len(rows)]
+                both[rows, 1, : len(rows)] = there.T
+        return both.astype(np.float32)
 
 
 def build(network: RoadNetwork, table: LaneTable) -> JunctionTable:

@@ -83,21 +83,30 @@ class Focus(struct.PyTreeNode):
     top_speed: jax.Array
 
 
-class Meeting(struct.PyTreeNode):
-    """What lanes have to do with lanes: owes int32; merges, forks bool; enter, leave m."""
+class Stretch(struct.PyTreeNode):
+    """Where a lane is too near to another: from enter to leave, m along it; both 0 if nowhere."""
 
-    owes: jax.Array
-    merges: jax.Array
-    forks: jax.Array
     enter: jax.Array
     leave: jax.Array
 
 
 class Pairs(struct.PyTreeNode):
-    """Every agent's focus (rows) against every crosser (columns), (N, M)."""
+    """Every agent's focus (rows) against every crosser (columns), (N, M).
 
-    mine: Meeting
-    theirs: Meeting
+    Attributes:
+      owes: int32, FREE or one of the CONFLICT codes of `junctions`.
+      merges, forks: bool, the lanes end, begin together.
+      mine, theirs: the stretches on the lanes of both.
+      focus: (N, 1) of each agent.
+      others: (1, M) crossers.
+      speed, wait_s, half_length: (N, 1) of each agent.
+    """
+
+    owes: jax.Array
+    merges: jax.Array
+    forks: jax.Array
+    mine: Stretch
+    theirs: Stretch
     focus: Focus
     others: Crossers
     speed: jax.Array
@@ -167,9 +176,24 @@ def focus_of(agents: Agents, road_map: RoadMap, top_speed: jax.Array) -> Focus:
 
 def pairs(agents: Agents, focus: Focus, others: Crossers, road_map: RoadMap) -> Pairs:
     """Looks up how each focus meets each lane of others."""
+    row, seen = jnp.maximum(focus.lane, 0), jnp.maximum(others.lane, 0)
+    slots = jnp.arange(road_map.lane_meeting.shape[-1])
+    is_slot = (road_map.lane_slot[seen][:, None] == slots).astype(jnp.float32)  # (M, J)
+    # A product of matrices that picks single numbers, exactly; a look-up for each pair within what
+    # follows would keep the compiler from vectorising all of it on a CPU.
+    found = jnp.einsum(
+        "ncj,mj->cnm", road_map.lane_meeting[row], is_slot, precision=jax.lax.Precision.HIGHEST
+    )
+    same = road_map.lane_junction[row][:, None] == road_map.lane_junction[seen][None, :]
+    same &= (focus.lane >= 0)[:, None] & (others.lane >= 0)[None, :]
+    mine, theirs = jnp.where(same, found.astype(jnp.int32), 0)
+    relation = (mine >> 2) & 3
     return Pairs(
-        mine=_meeting(focus.lane[:, None], others.lane[None, :], road_map),
-        theirs=_meeting(others.lane[None, :], focus.lane[:, None], road_map),
+        owes=mine & 3,
+        merges=(relation & MERGE) > 0,
+        forks=(relation & FORK) > 0,
+        mine=_stretch((mine >> 4) & MEETING_MASK, mine >> 14),
+        theirs=_stretch(theirs & 0xFFF, theirs >> 12),
         focus=jax.tree.map(lambda x: x[:, None], focus),
         others=jax.tree.map(lambda x: x[None, :], others),
         speed=agents.speed[:, None],
@@ -178,25 +202,9 @@ def pairs(agents: Agents, focus: Focus, others: Crossers, road_map: RoadMap) -> 
     )
 
 
-def _meeting(lane: jax.Array, other: jax.Array, road_map: RoadMap) -> Meeting:
-    row, seen = jnp.maximum(lane, 0), jnp.maximum(other, 0)
-    same = (lane >= 0) & (other >= 0)
-    same &= road_map.lane_junction[row] == road_map.lane_junction[seen]
-    found = jnp.where(same, road_map.lane_meeting[row, road_map.lane_slot[seen]], jnp.uint32(0))
-    bits = found.astype(jnp.int32)
-
-    def metres(shift: int) -> jax.Array:
-        steps = jax.lax.shift_right_logical(bits, jnp.int32(shift)) & MEETING_MASK
-        return steps.astype(jnp.float32) * jnp.float32(1 / MEETING_STEPS)
-
-    relation = (bits >> 2) & 3
-    return Meeting(
-        owes=bits & 3,
-        merges=(relation & MERGE) > 0,
-        forks=(relation & FORK) > 0,
-        enter=metres(4),
-        leave=metres(18),
-    )
+def _stretch(enter: jax.Array, leave: jax.Array) -> Stretch:
+    step = jnp.float32(1 / MEETING_STEPS)
+    return Stretch(enter.astype(jnp.float32) * step, leave.astype(jnp.float32) * step)
 
 
 def joined_gaps(pair: Pairs) -> jax.Array:
@@ -205,9 +213,9 @@ def joined_gaps(pair: Pairs) -> jax.Array:
     Where lanes part, to the one ahead until its tail is clear; where they join, to the one that is
     nearer to where they end.
     """
-    mine, theirs, focus, others = pair.mine, pair.theirs, pair.focus, pair.others
+    theirs, focus, others = pair.theirs, pair.focus, pair.others
     room = pair.half_length + others.half_length
-    parts = mine.forks & (others.s > focus.s) & (others.s - others.half_length < theirs.leave)
+    parts = pair.forks & (others.s > focus.s) & (others.s - others.half_length < theirs.leave)
     parts &= others.s > -others.half_length
     gap = jnp.where(parts, others.s - focus.s - room, FAR)
     return jnp.where(_joins(pair), _join_gap(pair) - room, gap)
@@ -223,13 +231,13 @@ def _join_gap(pair: Pairs) -> jax.Array:
 def _joins(pair: Pairs) -> jax.Array:
     """The other car's front is where the lanes join, and it is ahead."""
     there = pair.others.s + pair.others.half_length > pair.theirs.enter
-    return pair.mine.merges & there & (_join_gap(pair) > 0.0)
+    return pair.merges & there & (_join_gap(pair) > 0.0)
 
 
 def stretch_gaps(pair: Pairs) -> jax.Array:
     """(N,) m from the front bumper to the first stretch on which another car is; FAR for none."""
     theirs, focus, others = pair.theirs, pair.focus, pair.others
-    crosses = (pair.mine.leave > 0.0) & ~pair.mine.merges & ~pair.mine.forks
+    crosses = (pair.mine.leave > 0.0) & ~pair.merges & ~pair.forks
     there = others.s + others.half_length > theirs.enter
     there |= others.is_lawless & _collides(pair, MARGIN)
     there &= others.s - others.half_length < theirs.leave
@@ -265,7 +273,7 @@ def gated(pair: Pairs, may_go: jax.Array) -> jax.Array:
       pair: of everybody.
       may_go: (M,) bool, neither a light, a sign nor want of room keeps it from entering.
     """
-    mine, theirs, focus, others = pair.mine, pair.theirs, pair.focus, pair.others
+    theirs, focus, others = pair.theirs, pair.focus, pair.others
     front = others.s + others.half_length
     has_entered = front > ENTERED
     there = (front > theirs.enter) & (others.s - others.half_length < theirs.leave)
@@ -278,10 +286,10 @@ def gated(pair: Pairs, may_go: jax.Array) -> jax.Array:
     inside = has_entered & (others.s - others.half_length < theirs.leave) & ~_joins(pair)
     inside &= (_leaves(pair) + 0.5 * MARGIN > _arrives(pair)) & (there | ~stands)
     margin = jnp.clip(MARGIN * PATIENCE / (PATIENCE + pair.wait_s), LEAST_MARGIN, MARGIN)
-    yields = (mine.owes == CONFLICT_YIELD) | others.is_lawless
-    yields |= (mine.owes == CONFLICT) & _is_earlier(pair, order)
+    yields = (pair.owes == CONFLICT_YIELD) | others.is_lawless
+    yields |= (pair.owes == CONFLICT) & _is_earlier(pair, order)
     coming = ~has_entered & may_go[None, :] & yields & _collides(pair, margin)
-    waits = (mine.owes != FREE) & (inside | (coming & ~(stands & first)))
+    waits = (pair.owes != FREE) & (inside | (coming & ~(stands & first)))
     return waits.any(axis=1) & (focus.front[:, 0] < ENTERED)
 
 
@@ -297,11 +305,11 @@ def _is_earlier(pair: Pairs, order: jax.Array) -> jax.Array:
 
 def _collides(pair: Pairs, margin: jax.Array | float) -> jax.Array:
     """An agent that goes now and another would be on their stretches within a margin of time."""
-    mine, theirs, focus, others = pair.mine, pair.theirs, pair.focus, pair.others
+    theirs, focus, others = pair.theirs, pair.focus, pair.others
     theirs_in = _time(theirs.enter - others.s - others.half_length, others.speed, others.top_speed)
-    out = mine.leave - focus.s + pair.half_length
+    out = pair.mine.leave - focus.s + pair.half_length
     # A car that ends on one lane with the other only has to be ahead of it.
-    out = jnp.where(mine.merges, out + FOLLOWS * others.speed, out)
+    out = jnp.where(pair.merges, out + FOLLOWS * others.speed, out)
     mine_out = _time(out, pair.speed, focus.top_speed)
     return (_arrives(pair) < _leaves(pair) + margin) & (theirs_in < mine_out + margin)
 

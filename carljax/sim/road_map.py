@@ -41,8 +41,8 @@ class RoadMap(struct.PyTreeNode):
       lane_in_junction: (K,) bool.
       lane_junction: (K,) int32, running index of its junction, -1 outside.
       lane_slot: (K,) int32, place among the lanes of its junction, 0 outside.
-      lane_meeting: (K, J) uint32 over the slots of the same junction: who goes first, and where on
-        the lane the other one is too near (`junctions.MEETING_STEPS`).
+      lane_meeting: (K, 2, J) over the slots of the same junction: who goes first, and where on both
+        lanes the other one is too near, as whole numbers (`junctions.MEETING_STEPS`).
       lane_yield_s: (K,) m along it where it comes near the first lane that it has to mind at its
         junction: one it owes, or an equal one without lights; infinity where there is none.
       lane_signal: (K,) int32, SIGNAL_* bit shown by those who turn on it, 0 where it does not turn.

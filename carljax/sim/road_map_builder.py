@@ -41,7 +41,8 @@ def _shift(index: np.ndarray, offset: int) -> np.ndarray:
 
 def _widen(rows: np.ndarray, columns: int, fill: int) -> np.ndarray:
     """Pads rows on the right."""
-    return np.pad(rows, ((0, 0), (0, columns - rows.shape[1])), constant_values=fill)
+    missing = [(0, 0)] * (rows.ndim - 1) + [(0, columns - rows.shape[-1])]
+    return np.pad(rows, missing, constant_values=fill)
 
 
 def _lane_arrays(towns: Sequence[Town]) -> dict[str, np.ndarray]:
