@@ -99,6 +99,15 @@ def test_nobody_enters_while_another_is_on_its_way_in(world, front, waits):
     assert is_gated(world, cars(world, mine, other | {"speed": 1.0})) == waits
 
 
+@pytest.mark.parametrize(("speed", "waits"), [(8.0, True), (0.0, False)])
+def test_a_lawless_car_goes_first_but_not_while_it_stands_in_a_queue(world, speed, waits):
+    # The first has priority by its sign; the other, 6 m from the junction, minds no sign.
+    main, side = world.way("signs", "east", "straight"), world.way("signs", "north", "straight")
+    mine = {"lanes": main, "lane_s": 77.0, "speed": 0.0}
+    other = {"lanes": side, "lane_s": 80.0 - 2.0 - 6.0, "speed": speed, "is_lawless": True}
+    assert is_gated(world, cars(world, mine, other | {"cruise_speed": 10.0})) == waits
+
+
 def test_two_that_wait_for_one_another_get_going(world):
     # All four arms at once, at rest before the junction: each has another on its right and left.
     specs = [

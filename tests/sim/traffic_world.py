@@ -125,6 +125,8 @@ def cars(world, *specs):
         "has_stopped": np.zeros(SLOTS, bool),
         "wait_s": np.zeros(SLOTS),
         "past_lane": np.full(SLOTS, -1, np.int32),
+        "is_lawless": np.zeros(SLOTS, bool),
+        "cruise_speed": np.zeros(SLOTS),
     }
     for slot, spec in enumerate(specs):
         values["kind"][slot] = KIND_VEHICLE
