@@ -24,6 +24,7 @@ from carljax.sim.types import Agents
 STOP_MARGIN = 1.0  # m kept to a line and to a junction's entry. source: ours
 STRETCH_MARGIN = 0.5  # m kept to a stretch on which another car is. source: ours
 SLOWEST = 1.0  # m/s, the least free speed
+QUEUE_GAP = 6.0  # m between cars of a queue, at most. source: ours, three times IDM's gap at rest
 
 
 class Free(struct.PyTreeNode):
@@ -62,7 +63,7 @@ def accelerations(
     gap, leader_speed = leaders(jnp.minimum(along, priority.joined_gaps(pair)), movers)
     half = 0.5 * agents.length
     room = priority.has_room(focus, half, along, movers)
-    may_go = movers.can_go & jnp.append(room, True)
+    may_go = movers.can_go & jnp.append(room & ~_is_in_queue(along, movers), True)
     may_go = once(may_go | others.is_lawless)
     waits = priority.gated(pair, may_go) | (~room & (focus.front < priority.ENTERED))
     waits &= focus.lane >= 0
@@ -89,6 +90,12 @@ def accelerations(
     accel = jnp.minimum(accel, respond(still, jnp.zeros_like(still)))
     accel = jnp.where(agents.is_braking_hard, -driver.brake_max, accel)
     return jnp.where(agents.valid, accel, 0.0)
+
+
+def _is_in_queue(along: jax.Array, movers: Mover) -> jax.Array:
+    """(N,) bool, stands behind one that stands: to let it go first could be to wait for ever."""
+    to_queue = jnp.where(movers.is_queued, along, FAR).min(axis=1)
+    return movers.is_queued[:-1] & (to_queue < QUEUE_GAP)
 
 
 def free_speed(agents: Agents, road_map: RoadMap) -> Free:
