@@ -40,7 +40,7 @@ from carljax.sim.town import Town, load
 from carljax.sim.types import LIGHT_RED, STOP_LIGHT, STOP_SIGN, Agents, EgoState
 
 DT = 0.1  # s
-CHUNK = 500  # steps a call
+CHUNK = 300  # steps a call
 CARS_AT_ONCE = 256  # over all copies of a town
 HALT_SPEED = 0.25  # m/s, below which a car has halted
 HALT_RANGE = 6.0  # m before the line of a stop sign within which a halt counts
@@ -57,8 +57,10 @@ class Command:
     """Bundled towns by name, or paths of .xodr files; all bundled towns if none is given."""
     km: float = 1000.0
     """Kilometres that all cars of a town drive together."""
-    density: float = 15.0
+    density: float = 12.0
     """Cars for each kilometre of lane outside junctions."""
+    warm_up: float = 120.0
+    """Seconds before the count begins: cars set off from rest, evenly spread, without queues."""
     seed: int = 0
     """Of the cars and of all that they choose."""
     num_places: int = 5
@@ -126,6 +128,8 @@ def main() -> int:
 def measure(town: Town, command: Command) -> dict[str, Any]:
     """Lets the cars of a town drive until they have driven far enough."""
     road_map, spots, worlds = begin(town, command.density, command.seed)
+    for _ in range(round(command.warm_up / (DT * CHUNK))):
+        worlds, _ = run(road_map, spots, worlds)
     begun, km, parts = time.perf_counter(), 0.0, []
     while km < command.km:
         worlds, tally = run(road_map, spots, worlds)
