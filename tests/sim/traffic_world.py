@@ -42,14 +42,14 @@ def ego_place(lane=-1, next_lane=-1, s=0.0):
     return EgoPlace(lane=jnp.int32(lane), next_lane=jnp.int32(next_lane), s=f32(s))
 
 
-def drive(road_map, agents, light_time, key, ego, place, num_steps, driver=DRIVER):
+def drive(road_map, agents, light_time, key, ego, place, num_steps, driver=DRIVER, others=NOBODY):
     """Agents of all steps, the start included, and the light clock at each."""
 
     def step(carry, key):
         agents, time = carry
         clock = lights.clock(time, 0)
         after = traffic.step(
-            agents, NOBODY, ego, f32(EGO_LENGTH), place, road_map, clock, key, driver, DT
+            agents, others, ego, f32(EGO_LENGTH), place, road_map, clock, key, driver, DT
         )
         return (after, time + DT), after
 
@@ -126,6 +126,7 @@ def cars(world, *specs):
         "wait_s": np.zeros(SLOTS),
         "past_lane": np.full(SLOTS, -1, np.int32),
         "is_lawless": np.zeros(SLOTS, bool),
+        "is_braking_hard": np.zeros(SLOTS, bool),
         "cruise_speed": np.zeros(SLOTS),
     }
     for slot, spec in enumerate(specs):
