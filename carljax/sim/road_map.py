@@ -55,6 +55,9 @@ class RoadMap(struct.PyTreeNode):
       point_lane: (P,) int32.
       point_left, point_right: (P,) int32, the point of the lane beside to which traffic may change;
         -1 where there is none, in junctions and across solid lines.
+      point_oncoming: (P,) int32, the nearest point of oncoming traffic beside it where a car may
+        appear, -1 for none.
+      junction_arms: (Jn, A) int32 by `lane_junction`, lanes that lead into each junction, -1 pads.
       light_cycle: (L,) s, period of the junction's programme.
       light_start: (L,) s, when within it this light turns green.
       light_junction: (L,) int32, running index of its junction, -1 for a light on the open road.
@@ -97,6 +100,8 @@ class RoadMap(struct.PyTreeNode):
     point_lane: jax.Array
     point_left: jax.Array
     point_right: jax.Array
+    point_oncoming: jax.Array
+    junction_arms: jax.Array
     light_cycle: jax.Array
     light_start: jax.Array
     light_junction: jax.Array

@@ -48,6 +48,8 @@ def _widen(rows: np.ndarray, columns: int, fill: int) -> np.ndarray:
 def _lane_arrays(towns: Sequence[Town]) -> dict[str, np.ndarray]:
     rows: dict[str, list[np.ndarray]] = {}
     slots = max(t.junctions.conflict.shape[1] for t in towns)
+    arms = [spawn.arms(t.lanes, t.junctions.junction) for t in towns]
+    most_arms = max(a.shape[1] for a in arms)
     forks = max(t.lanes.successors.shape[1] for t in towns)
     for town, first in zip(towns, offsets(towns), strict=True):
         table, cross, light = town.lanes, town.junctions, town.lights
@@ -75,15 +77,22 @@ def _lane_arrays(towns: Sequence[Town]) -> dict[str, np.ndarray]:
             "point_width": table.point_width,
             "point_speed": table.point_speed,
             "point_lane": table.point_lane + first.lane,
+            "point_oncoming": _shift(
+                spawn.oncoming(table, town.network.left_hand_traffic), first.point
+            ),
             "point_left": _shift(town.neighbours.left, first.point),
             "point_right": _shift(town.neighbours.right, first.point),
+            "junction_arms": _widen(_shift(arms[first.town], first.lane), most_arms, -1),
             "light_cycle": light.cycle,
             "light_start": light.start,
             "light_junction": _shift(light.junction, first.junction),
         }
         for name, value in arrays.items():
             rows.setdefault(name, []).append(value)
-    return {name: np.concatenate(values) for name, values in rows.items()}
+    out = {name: np.concatenate(values) for name, values in rows.items()}
+    if len(out["junction_arms"]) == 0:  # the table is never empty: look-ups need no special case
+        out["junction_arms"] = np.full((1, most_arms), -1)
+    return out
 
 
 def _walk_arrays(towns: Sequence[Town]) -> dict[str, np.ndarray]:
