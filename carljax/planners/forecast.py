@@ -33,8 +33,11 @@ from carljax.sim.types import (
 STEP = 0.2  # s. source: ours; a car at 80 km/h moves by less than its length
 # Accelerations that last, m/s^2. source: PDM-Lite forecasts a braking car with -4.95
 ACCEL_MIN, ACCEL_MAX = -4.95, 1.5
-# m/s^2 with which others are trusted to halt at a line. source: ours, a firm stop
-TRUSTED_BRAKING = 4.0
+# m/s^2 that a halt at a line may still take of whoever does not brake yet, to be trusted to halt;
+# and of whoever brakes, with this fraction of what it takes. source: ours; a car at 50 km/h brakes
+# from 40 m on, and one at 10 m/s that has not begun 20 m before the line does not mean to
+TRUSTED_BRAKING, FIRM_BRAKING = 2.5, 5.0
+BRAKES_FRAC = 0.6
 Z_GAP = 3.0  # m in height that keep two apart. source: as for collisions
 
 
@@ -103,7 +106,9 @@ def _travelled(agents: Agents, time: jax.Array) -> jax.Array:
 def _room(agents: Agents, road_map: RoadMap, clock: LightClock) -> jax.Array:
     """(N,) m to the line at which a car will halt, infinity where there is none."""
     stop = right_of_way.stop_ahead(agents, road_map, clock)
-    can_halt = stop.distance > agents.speed**2 / (2.0 * TRUSTED_BRAKING)
+    needed = agents.speed**2 / (2.0 * jnp.maximum(stop.distance, 0.1))
+    brakes = (needed < FIRM_BRAKING) & (-agents.accel > BRAKES_FRAC * needed)
+    can_halt = (needed < TRUSTED_BRAKING) | brakes
     closed = (stop.kind == STOP_LIGHT) & (stop.light != LIGHT_GREEN)
     closed |= (stop.kind == STOP_SIGN) & ~agents.has_stopped
     closed |= (stop.kind == STOP_YIELD) & (agents.speed > 0.5)

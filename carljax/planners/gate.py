@@ -17,13 +17,16 @@ from carljax.sim.road_map import RoadMap
 from carljax.sim.types import Agents, EgoState
 
 HORIZON = 25  # moments of forecast, 5 s: what a turn from rest takes. source: ours
-# m/s^2 with which the ego is sure to halt before; with less room it goes on. source: ours
-BRAKING = 4.0
+# of the car's full braking, with which it halts before if it has to; with less room it goes on.
+# source: ours
+BRAKING_FRAC = 0.9
 CLEARANCE_S = 0.8  # s between others and the ego at first. source: ours
 LEAST_CLEARANCE_S = 0.3  # s, after long waiting. source: ours
 PATIENCE_S = 20.0  # s of waiting after which the least clearance is enough. source: ours
 SIDE_MARGIN = 0.3  # m on either side of others. source: ours
 HALT_MARGIN = 0.5  # m kept to the place from which others are in the way. source: ours
+# m past that place up to which it still waits there: it can't halt on the spot. source: ours
+OVERSHOOT = 0.5
 
 
 def next_gate(way: Way, road_map: RoadMap, car: VehicleParams) -> jax.Array:
@@ -37,8 +40,10 @@ def next_gate(way: Way, road_map: RoadMap, car: VehicleParams) -> jax.Array:
     minds = way.in_junction & (way.lane_s >= road_map.lane_yield_s[way.lane])
     front = 0.5 * car.length
     distance = jnp.arange(SAMPLES, dtype=jnp.float32)
-    begins = minds & ~jnp.roll(minds, 1) & (distance > front) & (distance > 0.0)
-    return jnp.where(begins, distance, jnp.inf).min() - front
+    begins = minds & ~jnp.roll(minds, 1) & (distance > front - OVERSHOOT) & (distance > 0.0)
+    # Samples are 1 m apart: the place lies somewhat before the first one beyond it.
+    beyond = jnp.clip(way.lane_s - road_map.lane_yield_s[way.lane], 0.0, 1.0)
+    return jnp.where(begins, distance - beyond, jnp.inf).min() - front
 
 
 def gap(
@@ -65,11 +70,13 @@ def gap(
       road_map: the map.
       car: the ego's box.
     """
-    room = next_gate(way, road_map, car) - HALT_MARGIN
+    at_gate = next_gate(way, road_map, car)
+    room = at_gate - HALT_MARGIN
     patience = jnp.clip(waited_s / PATIENCE_S, 0.0, 1.0)
     clearance = CLEARANCE_S + patience * (LEAST_CLEARANCE_S - CLEARANCE_S)
     margin = (2.0 * clearance * agents.speed, jnp.float32(2.0 * SIDE_MARGIN))
     met = forecast.hits(ego, agents, cast, way, distances, car, margin)
     beyond = (met.gap > room - 2.0) & (met.gap < jnp.inf) & (agents.speed > 0.3) & ~is_leader
-    can_halt = room > ego.speed**2 / (2.0 * BRAKING)
-    return jnp.where(beyond.any() & can_halt, room, jnp.inf)
+    braking = ego.speed**2 / (2.0 * BRAKING_FRAC * car.brake_max)
+    can_halt = at_gate + OVERSHOOT > braking
+    return jnp.where(beyond.any() & can_halt, jnp.maximum(room, 0.0), jnp.inf)

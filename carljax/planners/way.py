@@ -121,7 +121,7 @@ def ahead(found: Stretch) -> Way:
         speed_limit=window.speed_limit[row],
         in_junction=window.in_junction[row],
         lane=window.lane[row],
-        lane_s=window.lane_s[row],
+        lane_s=window.lane_s[row] + (at[1:-1] - row),
         stop_distance=jnp.where(is_known, to_line, jnp.inf),
     )
 

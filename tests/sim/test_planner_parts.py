@@ -321,15 +321,22 @@ def test_a_car_is_trusted_to_halt_at_a_red_light_if_it_can(world):
     plan = world.way("lights", "west", "straight")
     red = lights.clock(f32(start + 15.0), 0)
 
-    def end(s, speed):
+    def end(s, speed, accel=0.0):
         agents = cars(world, {"lanes": plan, "lane_s": s, "speed": speed})
+        agents = agents.replace(accel=jnp.full_like(agents.accel, accel))
         got = others(agents, Population(8, 0, 0), world.map, red, 25)
         return float(got.xy[-1, 0, 0])
 
-    # 8 m/s take 8 m to halt at 4 m/s^2. Its line is where its front bumper, 2 m ahead, comes to
-    # x = -10; without it, it would be at -90 + s + 40 after 5 s.
+    # Its line is where its front bumper, 2 m ahead, comes to x = -10; without it, it would be at
+    # -90 + s + 40 after 5 s. From 8 m/s it takes 32 / d to halt within d: 1.8 m/s^2 in 18 m.
     assert end(60.0, 8.0) == pytest.approx(-12.0, abs=0.05)
+    # 5.3 m/s^2 in 6 m.
     assert end(72.0, 8.0) == pytest.approx(22.0, abs=0.05)
+    # 2.7 m/s^2 in 12 m: who has not begun to brake does not mean to; with 2 m/s^2 it would come to
+    # a halt 16 m on, and is trusted to be at the line.
+    assert end(66.0, 8.0) == pytest.approx(16.0, abs=0.05)
+    assert end(66.0, 8.0, -2.0) == pytest.approx(-12.0, abs=0.05)
+    assert end(66.0, 8.0, -1.0) > 0.0
 
 
 def test_pedestrians_are_forecast_straight_on(world):
@@ -398,9 +405,38 @@ def test_the_gate_is_where_others_have_to_be_minded(world):
         lane=jnp.where(inside, row, 0),
         lane_s=f32(np.where(inside, distance - 30, 0)),
     )
-    begins = 30 + np.ceil(float(world.map.lane_yield_s[row]))
+    begins = 30 + float(world.map.lane_yield_s[row])
     got = float(next_gate(way, world.map, CAR))
     assert got == pytest.approx(begins - CAR.length / 2, abs=1e-4)
     # Past it there is none.
     gone = way.replace(in_junction=way.in_junction & (distance < 3))
     assert np.isinf(next_gate(gone, world.map, CAR))
+
+
+@pytest.mark.parametrize(
+    ("past", "speed", "room"),
+    # It halts half a metre before the gate: 9.5 m on, and where that is behind it on the spot.
+    [(-10.0, 5.0, 9.5), (-0.4, 0.5, 0.0), (0.3, 0.5, 0.0), (0.7, 0.5, np.inf)]
+    # 8 m/s take 4.9 m at nine tenths of the full braking, 6.5 m/s^2: it is too late for that.
+    + [(-6.0, 8.0, 5.5), (-4.0, 8.0, np.inf)],
+)
+def test_it_waits_at_the_gate_for_whoever_crosses_while_it_still_can(world, past, speed, room):
+    row = world.way("plain", "west", "left")[1]
+    at = CAR.length / 2 - past  # m along the way; somebody crosses it 8 m further on, all the time
+    lane_s = np.arange(SAMPLES) - at + float(world.map.lane_yield_s[row])
+    way = STRAIGHT.replace(
+        in_junction=jnp.asarray(lane_s >= 0),
+        lane=jnp.where(lane_s >= 0, row, 0),
+        lane_s=f32(np.maximum(lane_s, 0.0)),
+    )
+    values = {"xy": [[at + 8.0, 0.0]], "yaw": [np.pi / 2], "length": [4.0], "width": [2.0]}
+    agents = with_values(1, {**values, "speed": [4.0], "kind": [1], "lanes": [[0, -1, -1]]})
+    cast = forecast.Forecast(
+        xy=jnp.broadcast_to(agents.xy, (gate.HORIZON, 1, 2)),
+        yaw=jnp.full((gate.HORIZON, 1), np.pi / 2),
+    )
+    distances = f32(np.arange(1, gate.HORIZON + 1) * 0.2 * 6.0)
+    ego = make_ego((0.0, 0.0), 0.0, speed)
+    nobody = jnp.zeros(1, bool)
+    got = gate.gap(ego, agents, cast, way, distances, nobody, f32(0.0), world.map, CAR)
+    assert float(got) == pytest.approx(room, abs=1e-3)
