@@ -128,7 +128,7 @@ class DrivingEnv(struct.PyTreeNode):
         """
         key_light, key_scenarios, key = jax.random.split(key, 3)
         routes, zero_idx = self.bank.routes, jnp.zeros((), jnp.int32)
-        ego = _ego_at(routes.xy[episode_idx, 0], routes.z[episode_idx], routes.yaw[episode_idx, 0])
+        ego = ego_at(routes.xy[episode_idx, 0], routes.z[episode_idx], routes.yaw[episode_idx, 0])
         place = EgoPlace(routes.lane[episode_idx, 0], zero_idx - 1, routes.lane_s[episode_idx, 0])
         slots, agents = engine.start(
             script.empty_slots(self.config.num_scenario_slots),
@@ -311,7 +311,7 @@ def make_env(bank: EpisodeBank, config: EnvConfig, reward_config: RewardConfig) 
     )
 
 
-def _ego_at(xy: jax.Array, z: jax.Array, yaw: jax.Array) -> EgoState:
+def ego_at(xy: jax.Array, z: jax.Array, yaw: jax.Array) -> EgoState:
     """The ego at rest."""
     zero = jnp.zeros((), jnp.float32)
     return EgoState(
