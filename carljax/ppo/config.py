@@ -18,6 +18,9 @@ class NetworkConfig:
     """Image encoder: the paper's seven convolutions, Roach's six, or patches (fast on a CPU)."""
     layer_norm: bool = True
     """LayerNorm after every linear layer and convolution, before the ReLU; Roach has none."""
+    conv_init: Literal["xavier", "torch"] = "xavier"
+    """First values of the convolutions: Xavier with bias 0.1 (Roach, CaRL on CARLA), or PyTorch's
+    default (CaRL on nuPlan)."""
     beta_min: float = 1.0
     """Lower bound of the Beta parameters; 1 keeps the density finite, Roach used 0."""
     hidden_size: int = 256
