@@ -54,6 +54,9 @@ class PPOConfig:
     """Step size of Adam at the start."""
     anneal_lr: bool = True
     """Lower the learning rate linearly to zero over the run."""
+    lr_schedule: Literal["linear", "late"] = "linear"
+    """How: lr (1 - u / N) for update u = 0 ... N - 1, or an update later, lr (1 - (u - 1) / N), as
+    the authors' Python trainer has it."""
     adam_eps: float = 1e-5
     """Adam's epsilon."""
     max_grad_norm: float = 0.5
@@ -70,11 +73,18 @@ class PPOConfig:
     clip_vloss: float | None = 0.1
     """Range of the value around the one at collection, in units of return; None: not clipped."""
     norm_adv: bool = True
-    """Normalise advantages over each minibatch (of all devices together)."""
+    """Normalise advantages over each minibatch."""
+    norm_adv_scope: Literal["all", "device"] = "all"
+    """Over the minibatch of all devices together, or each device over its own part of it, as the
+    authors' code does for nuPlan; the same on one device."""
     ent_coef: float = 0.01
     """Weight of the entropy bonus."""
+    entropy_reduction: Literal["sum", "mean"] = "sum"
+    """Over the dimensions of the action in that bonus; Roach takes the mean."""
     vf_coef: float = 0.5
     """Weight of the value loss."""
+    vloss_half: bool = True
+    """Let the value loss be half the squared error; Roach takes all of it."""
 
     @property
     def batch_size(self) -> int:

@@ -9,6 +9,7 @@ summed already, once per micro-batch, and the `psum` would count them again.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -30,10 +31,12 @@ def make_optimizer(config: PPOConfig) -> optax.GradientTransformation:
 
 
 def learning_rate(update: jax.Array, config: PPOConfig) -> jax.Array:
-    """Returns () lr (1 - u / N) for update u, or lr."""
+    """Returns () lr (1 - u / N) for update u, or lr; see `PPOConfig.lr_schedule`."""
     rate = jnp.float32(config.learning_rate)
     if not config.anneal_lr:
         return rate
+    if config.lr_schedule == "late":
+        update = update - 1
     return rate * jnp.maximum(1.0 - update.astype(jnp.float32) / config.num_updates, 0.0)
 
 
@@ -114,7 +117,8 @@ def minibatch_gradient(
     weight = samples.weight[rows]
     advantage = samples.advantage[rows]
     if config.norm_adv:
-        advantage = normalise(advantage, weight)
+        over = sum_over_devices if config.norm_adv_scope == "all" else no_sum
+        advantage = normalise(advantage, weight, over)
     weight = weight / jnp.maximum(jax.lax.psum(jnp.sum(weight), AXIS), 1.0)
 
     def piece(rows: jax.Array, weight: jax.Array, advantage: jax.Array) -> tuple[Any, dict]:
@@ -142,19 +146,34 @@ def _sum_over(function: Any, pieces: list[jax.Array]) -> Any:
     return jax.lax.scan(add, zeros, pieces)[0]
 
 
-def normalise(advantage: jax.Array, weight: jax.Array) -> jax.Array:
-    """Shifts and scales advantages to mean 0 and (Bessel-corrected) deviation 1 over all devices.
+def sum_over_devices(x: jax.Array) -> jax.Array:
+    """Adds up a device's number with those of the others."""
+    return jax.lax.psum(x, AXIS)
+
+
+def no_sum(x: jax.Array) -> jax.Array:
+    """Leaves a device's number as it is."""
+    return x
+
+
+def normalise(
+    advantage: jax.Array,
+    weight: jax.Array,
+    total: Callable[[jax.Array], jax.Array] = sum_over_devices,
+) -> jax.Array:
+    """Shifts and scales advantages to mean 0 and (Bessel-corrected) deviation 1.
 
     Args:
       advantage: (M,) float32.
       weight: (M,) float32, 0 for samples that don't count.
+      total: `sum_over_devices`, or `no_sum` for the statistics of each device's own samples.
 
     Returns:
       (M,) float32.
     """
-    count = jax.lax.psum(jnp.sum(weight), AXIS)
-    mean = jax.lax.psum(jnp.sum(weight * advantage), AXIS) / jnp.maximum(count, 1.0)
-    squares = jax.lax.psum(jnp.sum(weight * jnp.square(advantage - mean)), AXIS)
+    count = total(jnp.sum(weight))
+    mean = total(jnp.sum(weight * advantage)) / jnp.maximum(count, 1.0)
+    squares = total(jnp.sum(weight * jnp.square(advantage - mean)))
     deviation = jnp.sqrt(squares / jnp.maximum(count - 1.0, 1.0))
     return (advantage - mean) / (deviation + 1e-8)  # source: CaRL's trainer
 

@@ -60,18 +60,26 @@ def _oracle(outputs, columns, config):
     entropy = np.vectorize(lambda a, b: stats.beta(a, b).entropy())(alpha, beta).sum(-1).mean()
     parts = {
         "policy_loss": -gain.mean(),
-        "value_loss": 0.5 * squared.mean(),
+        "value_loss": (0.5 if config.vloss_half else 1.0) * squared.mean(),
         "entropy": entropy,
         "approx_kl": np.mean(ratio - 1.0 - log_ratio),
         "clip_frac": np.mean((ratio < low) | (ratio > high)),
     }
-    total = parts["policy_loss"] - config.ent_coef * entropy + config.vf_coef * parts["value_loss"]
+    bonus = entropy / {"sum": 1, "mean": 2}[config.entropy_reduction]
+    total = parts["policy_loss"] - config.ent_coef * bonus + config.vf_coef * parts["value_loss"]
     return total, parts
 
 
-@pytest.mark.parametrize("clip_vloss", [0.1, None], ids=["value clipped", "value not clipped"])
-def test_loss_and_metrics_equal_the_oracle(clip_vloss):
-    config = PPOConfig(clip_vloss=clip_vloss, clip_coef=0.15, ent_coef=0.03, vf_coef=0.7)
+VARIANTS = {
+    "value clipped": dict(clip_vloss=0.1),
+    "value not clipped": dict(clip_vloss=None),
+    "Roach's": dict(clip_vloss=None, vloss_half=False, entropy_reduction="mean"),
+}
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_loss_and_metrics_equal_the_oracle(variant):
+    config = PPOConfig(clip_coef=0.15, ent_coef=0.03, vf_coef=0.7, **VARIANTS[variant])
     outputs, columns = _minibatch()
     expected, expected_parts = _oracle(outputs, columns, config)
     minibatch = Minibatch(obs=None, **jax.tree.map(jnp.float32, columns))
@@ -84,9 +92,9 @@ def test_loss_and_metrics_equal_the_oracle(clip_vloss):
         np.testing.assert_allclose(parts[name], part, rtol=1e-4, atol=1e-6, err_msg=name)
 
 
-@pytest.mark.parametrize("clip_vloss", [0.1, None], ids=["value clipped", "value not clipped"])
-def test_gradient_equals_finite_differences_of_the_oracle(clip_vloss):
-    config = PPOConfig(clip_vloss=clip_vloss, clip_coef=0.15, ent_coef=0.03, vf_coef=0.7)
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_gradient_equals_finite_differences_of_the_oracle(variant):
+    config = PPOConfig(clip_coef=0.15, ent_coef=0.03, vf_coef=0.7, **VARIANTS[variant])
     outputs, columns = _minibatch()
     minibatch = Minibatch(obs=None, **jax.tree.map(jnp.float32, columns))
     grads = jax.jit(jax.grad(lambda p: loss(p, OutputsAsParams(), minibatch, config)[0]))(
