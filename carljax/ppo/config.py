@@ -57,6 +57,12 @@ class PPOConfig:
     lr_schedule: Literal["linear", "late"] = "linear"
     """How: lr (1 - u / N) for update u = 0 ... N - 1, or an update later, lr (1 - (u - 1) / N), as
     the authors' Python trainer has it."""
+    kl_patience: int | None = None
+    """End an update after the epoch in which the policy has moved by more than `target_kl`, and
+    halve the learning rate when that has happened so many times (Roach: 8). None: neither."""
+    target_kl: float = 0.015
+    """Mean KL(old policy || new policy) of an action dimension that ends an update."""
+    # source: Roach, 1.5 x 0.01
     adam_eps: float = 1e-5
     """Adam's epsilon."""
     max_grad_norm: float = 0.5
@@ -113,6 +119,8 @@ class PPOConfig:
         for field in ("total_samples", "num_envs", "num_steps", "num_minibatches", "update_epochs"):
             if getattr(self, field) < 1:
                 raise ValueError(f"ppo.{field} must be at least 1, not {getattr(self, field)}")
+        if self.kl_patience is not None and self.kl_patience < 1:
+            raise ValueError(f"ppo.kl_patience must be at least 1, not {self.kl_patience}")
         _check_divides("ppo.num_envs", self.num_envs, "devices", num_devices)
         local_batch = self.batch_size // num_devices
         name = f"the batch of one of {num_devices} device(s) (num_envs x num_steps / devices)"

@@ -35,7 +35,8 @@ def loss(
     Returns:
       () loss and {name: ()} its parts (of the entropy always the sum over the action's dimensions),
       approx_kl (Schulman's estimator (r - 1) - log r) and clip_frac, the share of samples whose
-      ratio left the clip range.
+      ratio left the clip range. With `minibatch.policy` also kl, KL(old || new) itself, mean over
+      the action's dimensions.
     """
     alpha, beta_, value = forward(network, params, minibatch.obs)
     log_prob = beta.log_prob(minibatch.action, alpha, beta_)
@@ -58,6 +59,9 @@ def loss(
         "approx_kl": jnp.sum(weight * (ratio - 1.0 - log_ratio)),
         "clip_frac": jnp.sum(weight * outside),
     }
+    if minibatch.policy is not None:
+        kl = jnp.mean(beta.kl(*minibatch.policy, alpha, beta_), axis=-1)
+        parts["kl"] = jnp.sum(weight * kl)
     return total, jax.lax.stop_gradient(parts)
 
 

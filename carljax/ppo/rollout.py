@@ -24,6 +24,7 @@ def rollout(
     env_state: State,
     keys: jax.Array,
     num_steps: int,
+    keeps_policy: bool = False,
 ) -> tuple[State, Transition, jax.Array, dict[str, jax.Array]]:
     """Drives all environments for a number of steps.
 
@@ -35,6 +36,7 @@ def rollout(
       keys: (B,) PRNG keys, one per environment: what an environment does depends on its own key
         only, not on the device or the batch that it is in.
       num_steps: T.
+      keeps_policy: fill in `Transition.policy`.
 
     Returns:
       (B,) states after the last step; (T, B) transitions; (B,) value of the last states; {name: ()}
@@ -57,6 +59,7 @@ def rollout(
             done=next_state.done,
             truncation=next_state.info["truncation"],
             weight=1.0 - env_state.done,
+            policy=(alpha, beta_) if keeps_policy else None,
         )
         return next_state, (transition, _metric_sums(next_state, transition.weight))
 

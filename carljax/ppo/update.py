@@ -16,6 +16,7 @@ import jax
 import jax.numpy as jnp
 import optax
 
+from carljax.ppo import kl_patience
 from carljax.ppo.config import PPOConfig
 from carljax.ppo.loss import loss
 from carljax.ppo.networks import ActorCritic
@@ -50,6 +51,7 @@ def flatten(batch: Transition, advantage: jax.Array) -> Minibatch:
         advantage=advantage,
         target=advantage + batch.value,
         weight=batch.weight,
+        policy=batch.policy,
     )
     return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), samples)
 
@@ -76,7 +78,7 @@ def update(
 
     Returns:
       Parameters, optimiser state and {name: ()} means over all gradient steps of the loss's metrics
-      and of grad_norm (before clipping).
+      and of grad_norm (before clipping); with KL patience see `kl_patience.run_epochs`.
     """
     optimizer = make_optimizer(config)
     num_samples = samples.weight.shape[0]
@@ -95,8 +97,12 @@ def update(
         return jax.lax.scan(gradient_step, carry, rows)
 
     keys = jax.random.split(key, config.update_epochs)
-    (params, opt_state), metrics = jax.lax.scan(epoch, (params, opt_state), keys)
-    return params, opt_state, jax.tree.map(jnp.mean, metrics)
+    learner = (params, opt_state)
+    if config.kl_patience is not None:
+        learner, metrics = kl_patience.run_epochs(epoch, learner, keys, config.target_kl)
+        return *learner, metrics
+    learner, metrics = jax.lax.scan(epoch, learner, keys)
+    return *learner, jax.tree.map(jnp.mean, metrics)
 
 
 def minibatch_gradient(

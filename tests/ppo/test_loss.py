@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scipy import stats
+from scipy import integrate, stats
 
 from carljax.ppo.config import PPOConfig
 from carljax.ppo.loss import loss, surrogate, value_error
@@ -90,6 +90,31 @@ def test_loss_and_metrics_equal_the_oracle(variant):
     assert 0.0 < expected_parts["clip_frac"] < 1.0
     for name, part in expected_parts.items():
         np.testing.assert_allclose(parts[name], part, rtol=1e-4, atol=1e-6, err_msg=name)
+
+
+def test_kl_is_that_of_the_old_policy_to_the_new_one():
+    """Mean over both actions and over the samples that count, each integrated by SciPy."""
+    outputs, columns = _minibatch()
+    rng = np.random.default_rng(5)
+    old = [x + rng.uniform(-0.4, 0.4, x.shape) for x in outputs[:2]]
+
+    def integral(*parameters):
+        def integrand(x):
+            p, q = stats.beta(*parameters[:2]), stats.beta(*parameters[2:])
+            return p.pdf(x) * (p.logpdf(x) - q.logpdf(x))
+
+        return integrate.quad(integrand, 0.0, 1.0, epsabs=1e-7)[0]
+
+    rows = np.flatnonzero(columns["weight"])[:6]
+    columns["weight"] = np.where(np.isin(np.arange(NUM), rows), 1.0 / 6.0, 0.0)
+    expected = np.mean(np.vectorize(integral)(*[x[rows] for x in (*old, *outputs[:2])]))
+    policy = tuple(jnp.float32(x) for x in old)
+    minibatch = Minibatch(obs=None, policy=policy, **jax.tree.map(jnp.float32, columns))
+    params = jax.tree.map(jnp.float32, outputs)
+    total, parts = loss(params, OutputsAsParams(), minibatch, PPOConfig())
+    np.testing.assert_allclose(parts["kl"], expected, rtol=1e-3)
+    without, _ = loss(params, OutputsAsParams(), minibatch.replace(policy=None), PPOConfig())
+    assert total == without  # it is measured, not minimised
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
