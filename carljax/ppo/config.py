@@ -87,6 +87,8 @@ class PPOConfig:
     """Weight of the entropy bonus."""
     entropy_reduction: Literal["sum", "mean"] = "sum"
     """Over the dimensions of the action in that bonus; Roach takes the mean."""
+    hint_coef: float = 0.0
+    """Weight of the loss by exploration hints (Roach: 0.05); 0: there are none."""
     vf_coef: float = 0.5
     """Weight of the value loss."""
     vloss_half: bool = True
@@ -121,6 +123,8 @@ class PPOConfig:
                 raise ValueError(f"ppo.{field} must be at least 1, not {getattr(self, field)}")
         if self.kl_patience is not None and self.kl_patience < 1:
             raise ValueError(f"ppo.kl_patience must be at least 1, not {self.kl_patience}")
+        if not self.hint_coef >= 0.0:
+            raise ValueError(f"ppo.hint_coef must be at least 0, not {self.hint_coef}")
         _check_divides("ppo.num_envs", self.num_envs, "devices", num_devices)
         local_batch = self.batch_size // num_devices
         name = f"the batch of one of {num_devices} device(s) (num_envs x num_steps / devices)"

@@ -12,7 +12,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from carljax.ppo import beta
+from carljax.ppo import beta, hints
 from carljax.ppo.config import PPOConfig
 from carljax.ppo.networks import ActorCritic, forward
 from carljax.ppo.types import Minibatch
@@ -21,7 +21,7 @@ from carljax.ppo.types import Minibatch
 def loss(
     params: Any, network: ActorCritic, minibatch: Minibatch, config: PPOConfig
 ) -> tuple[jax.Array, dict[str, jax.Array]]:
-    """Computes policy_loss - ent_coef * entropy bonus + vf_coef * value_loss.
+    """Computes policy_loss - ent_coef * entropy bonus + vf_coef * value_loss, and hints' part.
 
     All means are sums weighted by `minibatch.weight`, which sums to 1 over the whole minibatch: the
     losses of its pieces, and their gradients, add up.
@@ -36,7 +36,7 @@ def loss(
       () loss and {name: ()} its parts (of the entropy always the sum over the action's dimensions),
       approx_kl (Schulman's estimator (r - 1) - log r) and clip_frac, the share of samples whose
       ratio left the clip range. With `minibatch.policy` also kl, KL(old || new) itself, mean over
-      the action's dimensions.
+      the action's dimensions; with `minibatch.hint` hint_loss.
     """
     alpha, beta_, value = forward(network, params, minibatch.obs)
     log_prob = beta.log_prob(minibatch.action, alpha, beta_)
@@ -59,6 +59,9 @@ def loss(
         "approx_kl": jnp.sum(weight * (ratio - 1.0 - log_ratio)),
         "clip_frac": jnp.sum(weight * outside),
     }
+    if minibatch.hint is not None:
+        parts["hint_loss"] = jnp.sum(weight * hints.divergence(alpha, beta_, minibatch.hint))
+        total += config.hint_coef * parts["hint_loss"]
     if minibatch.policy is not None:
         kl = jnp.mean(beta.kl(*minibatch.policy, alpha, beta_), axis=-1)
         parts["kl"] = jnp.sum(weight * kl)

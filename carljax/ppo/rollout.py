@@ -7,7 +7,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from carljax.ppo import beta
+from carljax.ppo import beta, hints
 from carljax.ppo.networks import ActorCritic, forward
 from carljax.ppo.types import Transition
 from carljax.sim import autoreset
@@ -25,6 +25,7 @@ def rollout(
     keys: jax.Array,
     num_steps: int,
     keeps_policy: bool = False,
+    keeps_hints: bool = False,
 ) -> tuple[State, Transition, jax.Array, dict[str, jax.Array]]:
     """Drives all environments for a number of steps.
 
@@ -37,6 +38,7 @@ def rollout(
         only, not on the device or the batch that it is in.
       num_steps: T.
       keeps_policy: fill in `Transition.policy`.
+      keeps_hints: fill in `Transition.hint`.
 
     Returns:
       (B,) states after the last step; (T, B) transitions; (B,) value of the last states; {name: ()}
@@ -60,6 +62,7 @@ def rollout(
             truncation=next_state.info["truncation"],
             weight=1.0 - env_state.done,
             policy=(alpha, beta_) if keeps_policy else None,
+            hint=hints.of_end(next_state.metrics) if keeps_hints else None,
         )
         return next_state, (transition, _metric_sums(next_state, transition.weight))
 

@@ -157,6 +157,7 @@ def _local_step(
         env_keys,
         config.num_steps,
         keeps_policy=config.kl_patience is not None,
+        keeps_hints=config.hint_coef > 0,
     )
     samples = make_samples(batch, last_value, config)
     rate = _rate(train_state, config)

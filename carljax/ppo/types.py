@@ -24,6 +24,7 @@ class Transition(struct.PyTreeNode):
       truncation: () float32, 1 where it ended without failure.
       weight: () float32, 0 on the step that restarts an ended episode: it carries no decision.
       policy: (A,) alpha and (A,) beta of the policy that acted; None unless a KL is to be measured.
+      hint: () int8, what an end at this step suggests, see `hints`; None without hints.
     """
 
     obs: Observation
@@ -35,6 +36,7 @@ class Transition(struct.PyTreeNode):
     truncation: jax.Array
     weight: jax.Array
     policy: tuple[jax.Array, jax.Array] | None = None
+    hint: jax.Array | None = None
 
 
 class Minibatch(struct.PyTreeNode):
@@ -49,6 +51,7 @@ class Minibatch(struct.PyTreeNode):
       target: () return that the critic learns.
       weight: () sums to 1 over the whole minibatch of all devices, so that sums are means.
       policy: as in `Transition`.
+      hint: () int8, what is suggested for this step; None without hints.
     """
 
     obs: Observation
@@ -59,6 +62,7 @@ class Minibatch(struct.PyTreeNode):
     target: jax.Array
     weight: jax.Array
     policy: tuple[jax.Array, jax.Array] | None = None
+    hint: jax.Array | None = None
 
 
 class TrainState(struct.PyTreeNode):

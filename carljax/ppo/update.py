@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 import optax
 
-from carljax.ppo import kl_patience
+from carljax.ppo import hints, kl_patience
 from carljax.ppo.config import PPOConfig
 from carljax.ppo.loss import loss
 from carljax.ppo.networks import ActorCritic
@@ -42,7 +42,10 @@ def learning_rate(update: jax.Array, config: PPOConfig) -> jax.Array:
 
 
 def flatten(batch: Transition, advantage: jax.Array) -> Minibatch:
-    """Joins time and environments to one axis of samples; the weights stay 0 or 1."""
+    """Joins time and environments to one axis of samples; the weights stay 0 or 1.
+
+    Before that, while time is an axis, hints are spread over the steps that they are for.
+    """
     samples = Minibatch(
         obs=batch.obs,
         action=batch.action,
@@ -52,6 +55,7 @@ def flatten(batch: Transition, advantage: jax.Array) -> Minibatch:
         target=advantage + batch.value,
         weight=batch.weight,
         policy=batch.policy,
+        hint=None if batch.hint is None else hints.spread(batch.hint, batch.weight),
     )
     return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), samples)
 

@@ -84,7 +84,11 @@ def test_epochs_end_with_the_first_above_the_target(kl, number):
 @functools.cache
 def _step(config, num_devices):
     mesh = trainer.make_mesh(num_devices)
-    return trainer.make_train_step(NETWORK, config, mesh), mesh
+    chex.clear_trace_counter()  # it counts by the function's name
+    with pytest.MonkeyPatch.context() as patch:
+        traced = chex.assert_max_traces(trainer._local_step, n=1)
+        patch.setattr(trainer, "_local_step", traced)
+        return trainer.make_train_step(NETWORK, config, mesh), mesh
 
 
 def _updates(num, config=CONFIG, num_devices=1, state=None):

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy import integrate, stats
 
+from carljax.ppo import hints
 from carljax.ppo.config import PPOConfig
 from carljax.ppo.loss import loss, surrogate, value_error
 from carljax.ppo.types import Minibatch
@@ -115,6 +116,27 @@ def test_kl_is_that_of_the_old_policy_to_the_new_one():
     np.testing.assert_allclose(parts["kl"], expected, rtol=1e-3)
     without, _ = loss(params, OutputsAsParams(), minibatch.replace(policy=None), PPOConfig())
     assert total == without  # it is measured, not minimised
+
+
+def test_hints_add_their_own_loss():
+    """Samples with the hint to stop: KL(Beta(a, b) || Beta(1, 1.5)) / 2 of the second action.
+
+    Here a = b = 2: with log B(1, 1.5) = log(2 / 3), log B(2, 2) = log(1 / 6), psi(2) = 1 - gamma
+    and psi(4) = 11 / 6 - gamma it is log 4 + (1 + 0.5) (1 - gamma) - 1.5 (11 / 6 - gamma)
+    = log 4 - 1.25.
+    """
+    outputs, columns = _minibatch()
+    outputs = (np.full((NUM, 2), 2.0), np.full((NUM, 2), 2.0), outputs[2])
+    plain = Minibatch(obs=None, **jax.tree.map(jnp.float32, columns))
+    is_hinted = np.arange(NUM) % 3 == 0
+    hinted = plain.replace(hint=jnp.asarray(np.where(is_hinted, hints.STOP, hints.NONE), jnp.int8))
+    params, config = jax.tree.map(jnp.float32, outputs), PPOConfig(hint_coef=0.05)
+    (total, parts), (without, _) = (
+        loss(params, OutputsAsParams(), minibatch, config) for minibatch in (hinted, plain)
+    )
+    expected = np.sum(columns["weight"][is_hinted]) * (np.log(4.0) - 1.25) / 2.0
+    np.testing.assert_allclose(parts["hint_loss"], expected, rtol=1e-4)
+    np.testing.assert_allclose(total - without, 0.05 * expected, rtol=1e-2, atol=1e-7)
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
