@@ -9,6 +9,7 @@ best score.
 
 from __future__ import annotations
 
+import dataclasses
 import logging
 import math
 from collections.abc import Iterator
@@ -177,14 +178,17 @@ def _is_key(leaf: Any) -> bool:
     return jax.dtypes.issubdtype(leaf.dtype, jax.dtypes.prng_key)
 
 
-def _split(train_state: Any) -> tuple[Any, Any]:
+def _split(train_state: Any) -> tuple[Any, dict[str, Any]]:
     """Parts a training state into parameters and the rest, random keys as their raw words."""
     raw = jax.tree.map(lambda x: jax.random.key_data(x) if _is_key(x) else x, train_state)
-    return raw.params, raw.replace(params=None)
+    fields = {field.name: getattr(raw, field.name) for field in dataclasses.fields(raw)}
+    # What a run doesn't have leaves no trace, so parts that came later don't make it unreadable.
+    learner = {name: value for name, value in fields.items() if value is not None}
+    return raw.params, {**learner, "params": None}
 
 
-def _join(like: Any, params: Any, learner: Any) -> Any:
-    raw = learner.replace(params=params)
+def _join(like: Any, params: Any, learner: dict[str, Any]) -> Any:
+    raw = like.replace(**{**learner, "params": params})
     return jax.tree.map(
         lambda x, y: jax.random.wrap_key_data(y, impl=jax.random.key_impl(x)) if _is_key(x) else y,
         like,

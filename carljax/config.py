@@ -26,6 +26,10 @@ from carljax.sim.env import EnvConfig
 HELD_OUT_SEED = 1_000_000_007
 
 
+# What is done with the policy's distribution when its driving is scored.
+Action = Literal["mean", "mode", "sample"]
+
+
 class ConfigError(ValueError):
     """A configuration that can't be used: one line that names file, field and reason."""
 
@@ -66,6 +70,9 @@ class RunConfig:
     # source: 100 iterations in the authors' trainers
     eval_routes: int = 64
     """Held-out routes driven at the end; 0 leaves the evaluation out."""
+    eval_action: Action = "mean"
+    """Action in that evaluation, and by default in `carljax.evaluate`: mean of the policy (CaRL),
+    its mode (Roach), or a sample as in training."""
     compile_cache: Path | None = None
     """Folder for JAX's persistent compilation cache; none by default."""
 

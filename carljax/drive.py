@@ -1,4 +1,4 @@
-"""Driving without exploration, by a network or a rule-based planner, until each route ends."""
+"""Driving to be scored, by a network or a rule-based planner, until each route ends."""
 
 from __future__ import annotations
 
@@ -7,15 +7,23 @@ from collections.abc import Callable
 from typing import Any, Protocol, Self
 
 import jax
+import jax.numpy as jnp
 from flax import struct
 
 from carljax import leaderboard
+from carljax.config import Action
 from carljax.leaderboard import Drive
 from carljax.planners import Planner
 from carljax.ppo import beta, trainer
 from carljax.ppo.networks import ActorCritic, forward
 from carljax.sim.env import DrivingEnv
 from carljax.sim.types import Observation, State
+
+# source: CaRL evaluates with the mean of the Beta policy, Roach with its mode
+STATISTICS = {"mean": beta.mean, "mode": beta.mode}
+# Folded into an episode's key for the policy's own draws: far from the few numbers by which the
+# environment splits that key.
+_POLICY_STREAM = 0x706F6C
 
 
 class Policy(Protocol):
@@ -27,8 +35,8 @@ class Policy(Protocol):
 
     needs_image: bool
 
-    def init(self, env: DrivingEnv) -> Any:
-        """Its memory at the start of one route."""
+    def init(self, env: DrivingEnv, key: jax.Array) -> Any:
+        """Its memory at the start of one route; the key is for what it leaves to chance."""
 
     def act(self, env: DrivingEnv, states: State, memory: Any) -> tuple[jax.Array, Any]:
         """Chooses for (B,) states and memories: (B, 2) float32 in [-1, 1], the next memories."""
@@ -38,25 +46,30 @@ class Policy(Protocol):
 
 
 class NetworkPolicy(struct.PyTreeNode):
-    """The mean action of a network. source: CaRL evaluates with the mean of the Beta policy.
+    """The actions of a network.
 
     Attributes:
       params: its variables.
       network: actor and critic.
+      action: the mean or the mode of its Beta policy, or a sample.
       needs_image: always.
     """
 
     params: Any
     network: ActorCritic = struct.field(pytree_node=False)
+    action: Action = struct.field(pytree_node=False, default="mean")
     needs_image: bool = struct.field(pytree_node=False, default=True)
 
-    def init(self, env: DrivingEnv) -> Any:
-        """Remembers nothing."""
-        return ()
+    def init(self, env: DrivingEnv, key: jax.Array) -> Any:
+        """Remembers the key of its samples, else nothing."""
+        return key if self.action == "sample" else ()
 
     def act(self, env: DrivingEnv, states: State, memory: Any) -> tuple[jax.Array, Any]:
         """See `Policy`."""
-        return act(self.network, self.params, states.obs), memory
+        if self.action == "sample":
+            return act_by_chance(self.network, self.params, states.obs, memory)
+        statistic = STATISTICS[self.action]
+        return act(self.network, self.params, states.obs, statistic), memory
 
 
 class PlannerPolicy(struct.PyTreeNode):
@@ -70,8 +83,8 @@ class PlannerPolicy(struct.PyTreeNode):
     planner: Planner = struct.field(pytree_node=False)
     needs_image: bool = struct.field(pytree_node=False, default=False)
 
-    def init(self, env: DrivingEnv) -> Any:
-        """See `Policy`."""
+    def init(self, env: DrivingEnv, key: jax.Array) -> Any:
+        """See `Policy`; leaves nothing to chance."""
         return self.planner.init(env)
 
     def act(self, env: DrivingEnv, states: State, memory: Any) -> tuple[jax.Array, Any]:
@@ -87,19 +100,44 @@ class Run(struct.PyTreeNode):
     memory: Any
 
 
-def act(network: ActorCritic, params: Any, obs: Observation) -> jax.Array:
-    """Chooses a network's mean actions.
+def act(
+    network: ActorCritic,
+    params: Any,
+    obs: Observation,
+    statistic: Callable[[jax.Array, jax.Array], jax.Array] = beta.mean,
+) -> jax.Array:
+    """Chooses a network's actions without chance.
 
     Args:
       network: actor and critic.
       params: its variables.
       obs: (B,) observations.
+      statistic: of the Beta policy, one of `STATISTICS`.
 
     Returns:
       (B, 2) float32 in [-1, 1].
     """
     alpha, beta_, _ = forward(network, params, obs)
-    return beta.to_command(beta.mean(alpha, beta_))
+    return beta.to_command(statistic(alpha, beta_))
+
+
+def act_by_chance(
+    network: ActorCritic, params: Any, obs: Observation, keys: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """Draws a network's actions, each from a key of its own.
+
+    Args:
+      network: actor and critic.
+      params: its variables.
+      obs: (B,) observations.
+      keys: (B,) PRNG keys.
+
+    Returns:
+      (B, 2) float32 in [-1, 1], and the (B,) keys of the next draws.
+    """
+    alpha, beta_, _ = forward(network, params, obs)
+    keys, keys_now = jnp.moveaxis(jax.vmap(jax.random.split)(keys), 1, 0)
+    return beta.to_command(jax.vmap(beta.sample)(keys_now, alpha, beta_)), keys
 
 
 def start(policy: Policy, env: DrivingEnv, episodes: jax.Array, key: jax.Array) -> Run:
@@ -109,15 +147,18 @@ def start(policy: Policy, env: DrivingEnv, episodes: jax.Array, key: jax.Array) 
       policy: who will drive.
       env: the environment.
       episodes: (B,) int32, rows of its bank.
-      key: PRNG key of what the episodes leave open; the same key and row give the same start.
+      key: PRNG key of what the episodes leave open; the same key and row give the same start, and
+        to a policy that samples the same draws.
 
     Returns:
       (B,) drives with memories.
     """
 
     def one(episode: jax.Array) -> Run:
-        state = env.start_episode(episode, jax.random.fold_in(key, episode))
-        return Run(leaderboard.begin(_seen(policy, env, state)), policy.init(env))
+        key_episode = jax.random.fold_in(key, episode)
+        state = env.start_episode(episode, key_episode)
+        memory = policy.init(env, jax.random.fold_in(key_episode, _POLICY_STREAM))
+        return Run(leaderboard.begin(_seen(policy, env, state)), memory)
 
     return jax.vmap(one)(episodes)
 

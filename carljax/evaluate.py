@@ -1,8 +1,8 @@
 """`python -m carljax.evaluate`: the Driving Score of a policy or of a rule-based planner.
 
-All routes are driven at once by one compiled loop that ends with the last of them. Actions are the
-mean of the policy; routes and the key of the traffic are fixed, so the same driver gets the same
-score. A repetition has another key of its own.
+All routes are driven at once by one compiled loop that ends with the last of them. Routes and the
+key of the traffic, and of a policy that samples, are fixed, so the same driver gets the same score.
+A repetition has another key of its own.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from rich.console import Console
 from carljax import atomic, build, checkpoint, courses, drive, machine, result_file, run_dir
 from carljax import score_table as table
 from carljax.checkpoint import CheckpointError
-from carljax.config import ConfigError, TrainConfig
+from carljax.config import Action, ConfigError, TrainConfig
 from carljax.courses import Course
 from carljax.drive import NetworkPolicy, PlannerPolicy, Policy, Run
 from carljax.leaderboard import EVENTS, Drive
@@ -153,6 +153,9 @@ class Command:
     """Take the checkpoint with the best mean return instead of the newest."""
     untrained: bool = False
     """Take a newly initialised network of the same kind instead, for comparison."""
+    action: Action | None = None
+    """Drive with the mean of the policy (CaRL), its mode (Roach) or samples; as the run says by
+    default."""
     planner: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
     """Score this rule-based planner instead of a checkpoint."""
     routes: Annotated[Path | None, tyro.conf.arg(metavar="FILE.xml|BANK.npz")] = None
@@ -248,6 +251,8 @@ def _check(command: Command) -> None:
             )
         if command.best or command.untrained:
             raise ConfigError("--best and --untrained go with --checkpoint, not with --planner")
+        if command.action is not None:
+            raise ConfigError("--action goes with --checkpoint, not with --planner")
     for name, value in (("num-routes", command.num_routes), ("repetitions", command.repetitions)):
         if value is not None and value < 1:
             raise ConfigError(f"--{name} {value}: is below the least allowed, 1")
@@ -300,6 +305,7 @@ def _policy(
         return PlannerPolicy(PLANNERS[name]), {"policy": name, "update": None}
     path, update = run_dir.split_checkpoint(command.checkpoint)
     network = ActorCritic(config.network)
+    action: Action = command.action or config.run.eval_action
 
     def initialise(env: DrivingEnv) -> Any:
         first = env.reset(jax.random.key(TRAFFIC_SEED))
@@ -307,14 +313,14 @@ def _policy(
         return network.init(jax.random.key(config.run.seed), batch)
 
     if command.untrained:
-        return NetworkPolicy(jax.jit(initialise)(env), network), {
-            "policy": "untrained",
-            "update": None,
-        }
+        params = jax.jit(initialise)(env)
+        who: dict[str, Any] = {"policy": "untrained", "update": None, "action": action}
+        return NetworkPolicy(params, network, action), who
     chosen = checkpoint.best(path) if command.best else update
     chosen = chosen if chosen is not None else max(checkpoint.updates(path), default=None)
     params = checkpoint.restore_params(path, jax.eval_shape(initialise, env), chosen)
-    return NetworkPolicy(params, network), {"policy": str(path), "update": chosen}
+    who = {"policy": str(path), "update": chosen, "action": action}
+    return NetworkPolicy(params, network, action), who
 
 
 if __name__ == "__main__":

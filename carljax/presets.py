@@ -8,6 +8,7 @@ import jax
 
 from carljax.config import RunConfig, TrainConfig
 from carljax.ppo.config import NetworkConfig, PPOConfig
+from carljax.reward.config import RewardConfig
 from carljax.sim.env import EnvConfig
 from carljax.sim.raster_canvas import RasterConfig
 
@@ -63,6 +64,72 @@ ATARI = dataclasses.replace(
     run=RunConfig(num_routes=4096, checkpoint_every=500),
 )
 
+# What the two columns below see and are paid for. This is the place where their observation and
+# reward are chosen; Roach's view is 192 px at 5 px/m, 30 m ahead, 8 m behind, 19.2 m to each side.
+# source: the authors' code and Roach's
+ROACH_ENV = EnvConfig(
+    raster=RasterConfig(height=192, width=192, pixels_per_metre=5.0, ego_from_bottom_px=40)
+)
+ROACH_REWARD = RewardConfig()
+NUPLAN_ENV = EnvConfig()
+NUPLAN_REWARD = RewardConfig()
+
+# source: CaRL paper, table of PPO hyperparameters, column Roach; what the table leaves open (KL
+# patience, targets of the hints, loss terms, initialisation, the mode as action) from Roach's code.
+# Six environments go on one device.
+ROACH = TrainConfig(
+    env=ROACH_ENV,
+    reward=ROACH_REWARD,
+    network=NetworkConfig(encoder="roach", layer_norm=False, beta_min=0.0),
+    ppo=PPOConfig(
+        total_samples=10_000_000,
+        num_envs=6,
+        num_steps=2048,
+        num_minibatches=48,
+        update_epochs=20,
+        learning_rate=1e-5,
+        anneal_lr=False,
+        kl_patience=8,
+        target_kl=0.015,
+        gamma=0.99,
+        gae_lambda=0.9,
+        clip_coef=0.2,
+        clip_vloss=None,
+        norm_adv=False,
+        ent_coef=0.01,
+        entropy_reduction="mean",
+        hint_coef=0.05,
+        vf_coef=0.5,
+        vloss_half=False,
+        max_grad_norm=0.5,
+    ),
+    run=RunConfig(num_routes=4096, num_devices=1, eval_action="mode"),
+)
+
+# source: CaRL paper, table of PPO hyperparameters, column CaRL (nuPlan), 500 M; the authors' code
+# leaves the convolutions as PyTorch makes them. What is not set is as in carl-carla.
+CARL_NUPLAN = TrainConfig(
+    env=NUPLAN_ENV,
+    reward=NUPLAN_REWARD,
+    network=NetworkConfig(encoder="carl", conv_init="torch"),
+    ppo=dataclasses.replace(
+        CARL_CARLA.ppo,
+        total_samples=500_000_000,
+        num_envs=512,
+        num_steps=32,
+        num_minibatches=4,
+        update_epochs=4,
+        micro_batch_size=512,  # what is left of a minibatch on one of eight devices
+    ),
+    run=RunConfig(num_routes=4096, checkpoint_every=500),
+)
+
+# source: the same column, 1 B
+CARL_NUPLAN_1B = dataclasses.replace(
+    CARL_NUPLAN,
+    ppo=dataclasses.replace(CARL_NUPLAN.ppo, total_samples=1_000_000_000, num_envs=1024),
+)
+
 # Ours: the same reward and loss for minutes on two cores. A small image (48 m ahead, 20 m to the
 # sides) that shows the whole route, a patch encoder, and for a run this short larger steps, wider
 # clipping, and a discount under which waiting out a red light is worth while (0.99 halves the value
@@ -94,6 +161,13 @@ PRESETS = {
     "cpu": Preset("Small image and network: learns on two CPU cores in minutes.", CPU),
     "carl-carla": Preset(
         "The paper's CARLA column: 256 px, seven convolutions, 300 M.", CARL_CARLA
+    ),
+    "carl-nuplan": Preset(
+        "PPO and network of the paper's nuPlan column: 512 environments, 500 M.", CARL_NUPLAN
+    ),
+    "carl-nuplan-1b": Preset("The same with 1,024 environments, 1 B.", CARL_NUPLAN_1B),
+    "roach": Preset(
+        "PPO and network of Roach: KL patience, exploration hints, 6 environments, 10 M.", ROACH
     ),
     "atari": Preset("PPO as for Atari, else as carl-carla: 8 environments, 10 M.", ATARI),
 }

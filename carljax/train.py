@@ -146,11 +146,12 @@ def score(made: Setup, params: Any, path: Path, console: Console) -> None:
     """Evaluates the policy on held-out routes; prints the table and writes evaluation.json."""
     course = courses.held_out(made.config, made.towns, made.config.run.eval_routes)
     since = time.perf_counter()
-    policy = NetworkPolicy(jax.device_get(params), made.network)
+    action = made.config.run.eval_action
+    policy = NetworkPolicy(jax.device_get(params), made.network, action)
     result = evaluate.evaluate(course, policy)
     seconds = time.perf_counter() - since
     score_table.show(result, console, title=course.title)
-    evaluate.save(result, path / evaluate.FILE, seconds, course=course.title)
+    evaluate.save(result, path / evaluate.FILE, seconds, course=course.title, action=action)
 
 
 def describe(made: Setup, console: Console) -> None:

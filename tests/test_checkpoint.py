@@ -55,6 +55,23 @@ def test_restores_every_leaf_exactly(tmp_path):
     assert_same(checkpoint.restore(tmp_path, make_state(0)), saved)
 
 
+@struct.dataclass
+class LaterState(SmallState):
+    """The same with a part that a run may lack."""
+
+    patience: Any = None
+
+
+def test_a_part_that_a_run_lacks_is_not_asked_for(tmp_path):
+    """Neither of a state that was saved before there was such a part."""
+    rest = {name: getattr(make_state(7), name) for name in make_state(7).__dataclass_fields__}
+    checkpoint.save(tmp_path, make_state(7), update=7, score=0.5, keep=2)
+    assert_same(checkpoint.restore(tmp_path, LaterState(**rest)), make_state(7))
+    checkpoint.save(tmp_path, LaterState(**rest, patience=jnp.int32(3)), 8, 0.5, keep=2)
+    like = LaterState(**rest, patience=jnp.int32(0))
+    assert int(checkpoint.restore(tmp_path, like).patience) == 3
+
+
 def test_parameters_can_be_restored_alone(tmp_path):
     checkpoint.save(tmp_path, make_state(7), update=7, score=0.5, keep=2)
     params = checkpoint.restore_params(tmp_path, make_state(0).params)

@@ -121,28 +121,132 @@ def test_the_seed_of_the_held_out_routes_is_refused():
         RunConfig(seed=config.HELD_OUT_SEED).validate()
 
 
-def test_the_papers_preset_has_the_papers_values():
-    # CaRL paper, table of PPO hyperparameters, column CaRL (CARLA)
-    ppo = presets.PRESETS["carl-carla"].config.ppo
-    assert ppo.batch_size == 65536
-    assert ppo.minibatch_size == 16384
-    assert ppo.num_updates == 4578  # 300e6 / 65536 = 4577.6
-    assert ppo.num_minibatches * ppo.update_epochs - 1 == 11  # steps off-policy
-    assert (ppo.learning_rate, ppo.clip_coef, ppo.ent_coef, ppo.vf_coef) == (2.5e-4, 0.1, 0.01, 0.5)
-    assert (ppo.gamma, ppo.gae_lambda, ppo.max_grad_norm) == (0.99, 0.95, 0.5)
+# CaRL paper, table of all PPO hyperparameters: its rows, and its columns in order. "Steps per
+# epoch" are minibatches; "off-policy" are all gradient steps but the first.
+ROWS = (
+    *("samples", "learning rate", "schedule", "environments", "steps", "batch", "minibatch"),
+    *("steps per epoch", "epochs", "off-policy", "hints", "norm adv", "clip vloss", "entropy"),
+    *("vf", "gamma", "lambda", "clip", "grad norm"),
+)
+CARL = (0.01, 0.5, 0.99, 0.95, 0.1, 0.5)
+M = 1_000_000
+TABLE = {
+    "roach": (
+        *(10 * M, 1e-5, "KL patience", 6, 2048, 12288, 256),
+        *(48, 20, 959, True, False, False, 0.01, 0.5, 0.99, 0.9, 0.2, 0.5),
+    ),
+    "atari": (
+        *(10 * M, 2.5e-4, "linear", 8, 128, 1024, 256),
+        *(4, 4, 15, False, True, True, *CARL),
+    ),
+    "carl-carla": (
+        *(300 * M, 2.5e-4, "linear", 128, 512, 65536, 16384),
+        *(4, 3, 11, False, True, True, *CARL),
+    ),
+    "carl-nuplan": (
+        *(500 * M, 2.5e-4, "linear", 512, 32, 16384, 4096),
+        *(4, 4, 15, False, True, True, *CARL),
+    ),
+    "carl-nuplan-1b": (
+        *(1000 * M, 2.5e-4, "linear", 1024, 32, 32768, 8192),
+        *(4, 4, 15, False, True, True, *CARL),
+    ),
+}
 
 
-def test_the_atari_preset_has_the_papers_values():
-    # CaRL paper, table of PPO hyperparameters, column Atari
-    ppo = presets.PRESETS["atari"].config.ppo
-    assert (ppo.num_envs, ppo.num_steps, ppo.batch_size, ppo.minibatch_size) == (8, 128, 1024, 256)
-    assert ppo.num_minibatches * ppo.update_epochs - 1 == 15  # steps off-policy
-    assert (ppo.total_samples, ppo.learning_rate) == (10_000_000, 2.5e-4)
+def _schedule(ppo):
+    if ppo.kl_patience is not None:
+        assert not ppo.anneal_lr
+        return "KL patience"
+    return {"linear": "linear", "late": "Python trainer"}[ppo.lr_schedule] if ppo.anneal_lr else ""
+
+
+@pytest.mark.parametrize("name", TABLE)
+def test_a_column_of_the_paper_has_the_papers_values(name):
+    ppo = presets.PRESETS[name].config.ppo
+    actual = (
+        *(ppo.total_samples, ppo.learning_rate, _schedule(ppo), ppo.num_envs, ppo.num_steps),
+        *(ppo.batch_size, ppo.minibatch_size, ppo.num_minibatches, ppo.update_epochs),
+        *(ppo.num_minibatches * ppo.update_epochs - 1, ppo.hint_coef > 0, ppo.norm_adv),
+        *(ppo.clip_vloss is not None, ppo.ent_coef, ppo.vf_coef, ppo.gamma, ppo.gae_lambda),
+        *(ppo.clip_coef, ppo.max_grad_norm),
+    )
+    assert dict(zip(ROWS, actual, strict=True)) == dict(zip(ROWS, TABLE[name], strict=True))
+
+
+def test_every_preset_but_ours_is_a_column_of_the_paper():
+    assert set(presets.PRESETS) == {*TABLE, "cpu"}
+
+
+# What the paper's table leaves open, from the authors' and Roach's code: value clip, Adam's
+# epsilon, KL patience and target, weight of the hints, half of the squared error, entropy over the
+# actions, scope of the normalisation, value of a truncated end.
+OPEN = dict.fromkeys(TABLE, (0.1, 1e-5, None, 0.015, 0.0, True, "sum", "all", True))
+OPEN["roach"] = (None, 1e-5, 8, 0.015, 0.05, False, "mean", "all", True)
+
+
+@pytest.mark.parametrize("name", TABLE)
+def test_what_the_table_leaves_open_is_as_in_the_code(name):
+    ppo = presets.PRESETS[name].config.ppo
+    names = ("clip_vloss", "adam_eps", "kl_patience", "target_kl", "hint_coef", "vloss_half")
+    names += ("entropy_reduction", "norm_adv_scope", "bootstrap_truncated")
+    assert tuple(getattr(ppo, field) for field in names) == OPEN[name]
+
+
+@pytest.mark.parametrize(
+    ("name", "expected"),
+    [
+        # encoder, LayerNorm, initialisation, least alpha and beta, action when scored
+        ("carl-carla", ("carl", True, "xavier", 1.0, "mean")),
+        ("atari", ("carl", True, "xavier", 1.0, "mean")),
+        ("carl-nuplan", ("carl", True, "torch", 1.0, "mean")),
+        ("carl-nuplan-1b", ("carl", True, "torch", 1.0, "mean")),
+        ("roach", ("roach", False, "xavier", 0.0, "mode")),
+    ],
+)
+def test_the_network_of_a_preset(name, expected):
+    values = presets.PRESETS[name].config
+    network = values.network
+    assert expected == (
+        *(network.encoder, network.layer_norm, network.conv_init, network.beta_min),
+        values.run.eval_action,
+    )
+    assert (network.hidden_size, network.joint_size) == (256, 512)
+
+
+@pytest.mark.parametrize(
+    ("name", "expected"),
+    [
+        ("carl-carla", (256, 256, 2.0, 100)),  # 78 m ahead, 50 m behind
+        ("carl-nuplan", (256, 256, 2.0, 100)),
+        ("roach", (192, 192, 5.0, 40)),  # 30.4 m ahead, 8 m behind
+    ],
+)
+def test_the_image_of_a_preset(name, expected):
+    raster = presets.PRESETS[name].config.env.raster
+    actual = raster.height, raster.width, raster.pixels_per_metre, raster.ego_from_bottom_px
+    assert actual == expected
+
+
+def test_updates_of_the_papers_runs():
+    """Whole ones, rounded up.
+
+    10 M / 12,288 = 813.8, 10 M / 1,024 = 9765.6, 300 M / 65,536 = 4577.6, 500 M / 16,384 = 30517.6,
+    1 B / 32,768 likewise.
+    """
+    updates = [presets.PRESETS[name].config.ppo.num_updates for name in TABLE]
+    assert updates == [814, 9766, 4578, 30518, 30518]
 
 
 @pytest.mark.parametrize("name", sorted(presets.PRESETS))
 def test_presets_are_valid_on_one_device(name):
     presets.PRESETS[name].config.validate(num_devices=1)
+
+
+@pytest.mark.parametrize("num_devices", [2, 4, 8])
+@pytest.mark.parametrize("name", ["atari", "carl-carla", "carl-nuplan", "carl-nuplan-1b"])
+def test_the_papers_presets_are_valid_on_several_devices(name, num_devices):
+    presets.PRESETS[name].config.validate(num_devices)
 
 
 def test_without_an_accelerator_the_small_preset_is_the_default():

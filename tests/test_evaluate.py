@@ -301,6 +301,22 @@ def test_best_newest_and_untrained_are_different_policies(run, tmp_path):
     assert updates == {"newest": 2, "best": 1, "new": None}
 
 
+def test_the_action_is_an_option_and_samples_are_the_same_each_time(run, tmp_path):
+    """The run's own choice is the default; a sample is another drive than the mean, twice alike."""
+    scores = {}
+    chosen = str(run / "checkpoints" / "1")
+    for name, extra in {"run": [], "once": ["sample"], "again": ["sample"]}.items():
+        out = tmp_path / f"{name}.json"
+        flags = ["--action", *extra] if extra else []
+        assert command("--checkpoint", chosen, "--json", str(out), *flags) == 0
+        values = json.loads(out.read_text())["carljax"]
+        scores[name] = values["action"], values["routes"]
+    assert scores["run"][0] == CONFIG.run.eval_action == "mean"
+    assert scores["once"][0] == "sample"
+    assert scores["once"] == scores["again"]
+    assert scores["once"][1] != scores["run"][1]
+
+
 @pytest.fixture(scope="module")
 def bank(tmp_path_factory):
     """A bank of routes in the village."""
@@ -369,6 +385,7 @@ def test_a_planner_drives_without_a_checkpoint(bank, tmp_path, capsys):
         ([], "one of --checkpoint DIR and --planner"),
         (["--planner", "magic"], "--planner magic: there is no such planner; there are: idm"),
         (["--planner", "idm", "--best"], "go with --checkpoint"),
+        (["--planner", "idm", "--action", "mode"], "--action goes with --checkpoint"),
         (["--planner", "idm", "--routes", "routes.txt"], "routes.txt: is neither"),
         (["--planner", "idm", "--routes", "a.xml"], "--maps DIR go together"),
         (["--planner", "idm", "--maps", "."], "--maps DIR go together"),

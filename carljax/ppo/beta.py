@@ -1,8 +1,8 @@
 """The Beta policy: independent Beta(alpha, beta) per action dimension, on (0, 1).
 
 Source: Chou et al., Improving stochastic policy gradients with the Beta distribution (2017).
-Sums over the last axis, the action dimensions. The environment's action is 2 x - 1; densities are
-those of x, without a Jacobian.
+Sums over the last axis, the action dimensions (`kl` leaves them apart). The environment's action is
+2 x - 1; densities are those of x, without a Jacobian.
 """
 
 from __future__ import annotations
@@ -63,6 +63,31 @@ def entropy(alpha: jax.Array, beta: jax.Array) -> jax.Array:
         + (alpha + beta - 2.0) * digamma(alpha + beta)
     )
     return jnp.sum(terms, axis=-1)
+
+
+def kl(
+    alpha: jax.Array, beta: jax.Array, other_alpha: jax.Array, other_beta: jax.Array
+) -> jax.Array:
+    """Returns KL(Beta(alpha, beta) || Beta(other_alpha, other_beta)) of each action dimension.
+
+    log B(a', b') - log B(a, b) + (a - a') psi(a) + (b - b') psi(b) + (a' - a + b' - b) psi(a + b).
+
+    Args:
+      alpha: (..., A) float32.
+      beta: (..., A) float32.
+      other_alpha: (..., A) float32.
+      other_beta: (..., A) float32.
+
+    Returns:
+      (..., A) float32, not summed.
+    """
+    return (
+        betaln(other_alpha, other_beta)
+        - betaln(alpha, beta)
+        + (alpha - other_alpha) * digamma(alpha)
+        + (beta - other_beta) * digamma(beta)
+        + (other_alpha - alpha + other_beta - beta) * digamma(alpha + beta)
+    )
 
 
 def mean(alpha: jax.Array, beta: jax.Array) -> jax.Array:

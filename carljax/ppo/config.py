@@ -18,6 +18,9 @@ class NetworkConfig:
     """Image encoder: the paper's seven convolutions, Roach's six, or patches (fast on a CPU)."""
     layer_norm: bool = True
     """LayerNorm after every linear layer and convolution, before the ReLU; Roach has none."""
+    conv_init: Literal["xavier", "torch"] = "xavier"
+    """First values of the convolutions: Xavier with bias 0.1 (Roach, CaRL on CARLA), or PyTorch's
+    default (CaRL on nuPlan)."""
     beta_min: float = 1.0
     """Lower bound of the Beta parameters; 1 keeps the density finite, Roach used 0."""
     hidden_size: int = 256
@@ -51,6 +54,15 @@ class PPOConfig:
     """Step size of Adam at the start."""
     anneal_lr: bool = True
     """Lower the learning rate linearly to zero over the run."""
+    lr_schedule: Literal["linear", "late"] = "linear"
+    """How: lr (1 - u / N) for update u = 0 ... N - 1, or an update later, lr (1 - (u - 1) / N), as
+    the authors' Python trainer has it."""
+    kl_patience: int | None = None
+    """End an update after the epoch in which the policy has moved by more than `target_kl`, and
+    halve the learning rate when that has happened so many times (Roach: 8). None: neither."""
+    target_kl: float = 0.015
+    """Mean KL(old policy || new policy) of an action dimension that ends an update."""
+    # source: Roach, 1.5 x 0.01
     adam_eps: float = 1e-5
     """Adam's epsilon."""
     max_grad_norm: float = 0.5
@@ -67,11 +79,20 @@ class PPOConfig:
     clip_vloss: float | None = 0.1
     """Range of the value around the one at collection, in units of return; None: not clipped."""
     norm_adv: bool = True
-    """Normalise advantages over each minibatch (of all devices together)."""
+    """Normalise advantages over each minibatch."""
+    norm_adv_scope: Literal["all", "device"] = "all"
+    """Over the minibatch of all devices together, or each device over its own part of it, as the
+    authors' code does for nuPlan; the same on one device."""
     ent_coef: float = 0.01
     """Weight of the entropy bonus."""
+    entropy_reduction: Literal["sum", "mean"] = "sum"
+    """Over the dimensions of the action in that bonus; Roach takes the mean."""
+    hint_coef: float = 0.0
+    """Weight of the loss by exploration hints (Roach: 0.05); 0: there are none."""
     vf_coef: float = 0.5
     """Weight of the value loss."""
+    vloss_half: bool = True
+    """Let the value loss be half the squared error; Roach takes all of it."""
 
     @property
     def batch_size(self) -> int:
@@ -100,6 +121,10 @@ class PPOConfig:
         for field in ("total_samples", "num_envs", "num_steps", "num_minibatches", "update_epochs"):
             if getattr(self, field) < 1:
                 raise ValueError(f"ppo.{field} must be at least 1, not {getattr(self, field)}")
+        if self.kl_patience is not None and self.kl_patience < 1:
+            raise ValueError(f"ppo.kl_patience must be at least 1, not {self.kl_patience}")
+        if not self.hint_coef >= 0.0:
+            raise ValueError(f"ppo.hint_coef must be at least 0, not {self.hint_coef}")
         _check_divides("ppo.num_envs", self.num_envs, "devices", num_devices)
         local_batch = self.batch_size // num_devices
         name = f"the batch of one of {num_devices} device(s) (num_envs x num_steps / devices)"

@@ -3,10 +3,14 @@
 Source: CaRL paper, "Architecture", after Roach (Zhang et al. 2021). Every layer is linear or
 convolution, then LayerNorm, then ReLU; the LayerNorm of a convolution spans height, width and
 channels together and has an affine weight for each. The critic alone sees the value scalars.
+Weights start as in the authors' code: linear layers by PyTorch's default, convolutions by
+`NetworkConfig.conv_init`, LayerNorms at 1 and 0.
 """
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -26,7 +30,7 @@ CONV_BIAS = 0.1  # source: Roach's initialisation, kept by CaRL
 NORM_EPS = 1e-5  # source: PyTorch's default, which the paper's trainer used
 _MIN_SIZE = 2  # height and width of the paper's last feature map
 
-_conv_init = nn.initializers.variance_scaling(2.0, "fan_avg", "uniform")  # Xavier, ReLU gain
+_xavier = nn.initializers.variance_scaling(2.0, "fan_avg", "uniform")  # with ReLU's gain, sqrt 2
 
 
 class ActorCritic(nn.Module):
@@ -75,18 +79,14 @@ def forward(
 
 
 class Linear(nn.Module):
-    """A linear layer with PyTorch's default initialisation, uniform in +-1 / sqrt(inputs)."""
+    """A linear layer with PyTorch's default initialisation."""
 
     features: int
 
     @nn.compact
     def __call__(self, x: jax.Array) -> jax.Array:
         """Maps (N, I) to (N, features)."""
-        bound = x.shape[-1] ** -0.5
-
-        def init(key: jax.Array, shape: tuple[int, ...]) -> jax.Array:
-            return jax.random.uniform(key, shape, minval=-bound, maxval=bound)
-
+        init = _torch_init(x.shape[-1])
         kernel = self.param("kernel", init, (x.shape[-1], self.features))
         return matmul(x, kernel) + self.param("bias", init, (self.features,))
 
@@ -124,9 +124,7 @@ class ConvEncoder(nn.Module):
         """Maps (N, H, W, C) uint8 to (N, features) float32."""
         x = raster.astype(jnp.float32) * jnp.float32(1.0 / 255.0)
         for i, (features, kernel, stride) in enumerate(CONV_LAYERS[self.config.encoder]):
-            shape = (kernel, kernel, x.shape[-1], features)
-            weight = self.param(f"kernel_{i}", _conv_init, shape)
-            bias = self.param(f"bias_{i}", nn.initializers.constant(CONV_BIAS), (features,))
+            weight, bias = _conv_params(self, i, (kernel, kernel, x.shape[-1], features))
             padding, stride = conv_fit(x.shape[1:3], kernel, stride)
             x = conv(jnp.pad(x, ((0, 0), *padding, (0, 0))), weight, stride) + bias
             if self.config.layer_norm:
@@ -172,15 +170,37 @@ class PatchEncoder(nn.Module):
         scales = (jnp.float32(1.0 / 255.0), jnp.float32(1.0))
         layers = zip(sizes, self.config.patch_features, scales, strict=True)
         for i, (size, features, scale) in enumerate(layers):
-            shape = (size, size, x.shape[-1], features)
-            weight = self.param(f"kernel_{i}", _conv_init, shape)
-            bias = self.param(f"bias_{i}", nn.initializers.constant(CONV_BIAS), (features,))
+            weight, bias = _conv_params(self, i, (size, size, x.shape[-1], features))
             padding = [(0, -n % size) for n in x.shape[1:3]]
             x = patch_conv(jnp.pad(x, ((0, 0), *padding, (0, 0))), weight * scale, size) + bias
             if self.config.layer_norm:
                 x = nn.LayerNorm(epsilon=NORM_EPS)(x)
             x = nn.relu(x)
         return x.reshape(x.shape[0], -1)
+
+
+def _conv_params(
+    encoder: ConvEncoder | PatchEncoder, i: int, shape: tuple[int, int, int, int]
+) -> tuple[jax.Array, jax.Array]:
+    """Returns (K, K, I, O) weights and (O,) bias of an encoder's layer i."""
+    kernel_init: Any = _xavier
+    bias_init: Any = nn.initializers.constant(CONV_BIAS)
+    if encoder.config.conv_init == "torch":
+        kernel_init = bias_init = _torch_init(math.prod(shape[:-1]))
+    return (
+        encoder.param(f"kernel_{i}", kernel_init, shape),
+        encoder.param(f"bias_{i}", bias_init, shape[-1:]),
+    )
+
+
+def _torch_init(fan_in: int) -> Callable[[jax.Array, tuple[int, ...]], jax.Array]:
+    """PyTorch's default for weights and biases: uniform in +-1 / sqrt(inputs)."""
+    bound = fan_in**-0.5
+
+    def init(key: jax.Array, shape: tuple[int, ...]) -> jax.Array:
+        return jax.random.uniform(key, shape, minval=-bound, maxval=bound)
+
+    return init
 
 
 def _encoder(config: NetworkConfig) -> nn.Module:

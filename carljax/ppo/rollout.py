@@ -7,7 +7,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from carljax.ppo import beta
+from carljax.ppo import beta, hints
 from carljax.ppo.networks import ActorCritic, forward
 from carljax.ppo.types import Transition
 from carljax.sim import autoreset
@@ -24,6 +24,8 @@ def rollout(
     env_state: State,
     keys: jax.Array,
     num_steps: int,
+    keeps_policy: bool = False,
+    keeps_hints: bool = False,
 ) -> tuple[State, Transition, jax.Array, dict[str, jax.Array]]:
     """Drives all environments for a number of steps.
 
@@ -35,6 +37,8 @@ def rollout(
       keys: (B,) PRNG keys, one per environment: what an environment does depends on its own key
         only, not on the device or the batch that it is in.
       num_steps: T.
+      keeps_policy: fill in `Transition.policy`.
+      keeps_hints: fill in `Transition.hint`.
 
     Returns:
       (B,) states after the last step; (T, B) transitions; (B,) value of the last states; {name: ()}
@@ -57,6 +61,8 @@ def rollout(
             done=next_state.done,
             truncation=next_state.info["truncation"],
             weight=1.0 - env_state.done,
+            policy=(alpha, beta_) if keeps_policy else None,
+            hint=hints.of_end(next_state.metrics) if keeps_hints else None,
         )
         return next_state, (transition, _metric_sums(next_state, transition.weight))
 

@@ -15,8 +15,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
+from carljax.ppo import kl_patience
 from carljax.ppo.config import PPOConfig
 from carljax.ppo.gae import gae
+from carljax.ppo.kl_patience import KLPatience
 from carljax.ppo.networks import ActorCritic
 from carljax.ppo.rollout import mean_metrics, rollout
 from carljax.ppo.types import Minibatch, TrainState, Transition
@@ -36,6 +38,7 @@ _PLACES: dict[str, Any] = {
     "env_state": PartitionSpec(AXIS),
     "key": PartitionSpec(),
     "update": PartitionSpec(),
+    "patience": PartitionSpec(),
 }
 _SPEC = TrainState(**_PLACES)
 
@@ -95,6 +98,7 @@ def init(
             env_state=env_state,
             key=key_run,
             update=jnp.zeros((), jnp.int32),
+            patience=None if config.kl_patience is None else kl_patience.start(),
         )
 
     return jax.jit(build, out_shardings=shardings(mesh))(key, env)
@@ -146,10 +150,17 @@ def _local_step(
     )
     env_keys = _env_keys(key_rollout, device * num_envs + jnp.arange(num_envs))
     env_state, batch, last_value, metric_sums = rollout(
-        env, network, train_state.params, train_state.env_state, env_keys, config.num_steps
+        env,
+        network,
+        train_state.params,
+        train_state.env_state,
+        env_keys,
+        config.num_steps,
+        keeps_policy=config.kl_patience is not None,
+        keeps_hints=config.hint_coef > 0,
     )
     samples = make_samples(batch, last_value, config)
-    rate = learning_rate(train_state.update, config)
+    rate = _rate(train_state, config)
     params, opt_state, losses = update(
         train_state.params,
         train_state.opt_state,
@@ -169,8 +180,27 @@ def _local_step(
         env_state=env_state,
         key=train_state.key,
         update=train_state.update + 1,
+        patience=_patience(train_state, losses, config),
     )
     return train_state, metrics
+
+
+def _rate(train_state: TrainState, config: PPOConfig) -> jax.Array:
+    """Returns the () learning rate of this update."""
+    rate = learning_rate(train_state.update, config)
+    if train_state.patience is None:
+        return rate
+    return rate * train_state.patience.rate_scale
+
+
+def _patience(
+    train_state: TrainState, losses: dict[str, jax.Array], config: PPOConfig
+) -> KLPatience | None:
+    """Returns the next update's KL patience, if there is any."""
+    if train_state.patience is None or config.kl_patience is None:
+        return None
+    exceeded = losses[kl_patience.KL] > config.target_kl
+    return kl_patience.advance(train_state.patience, exceeded, config.kl_patience)
 
 
 def make_samples(batch: Transition, last_value: jax.Array, config: PPOConfig) -> Minibatch:

@@ -7,6 +7,7 @@ from typing import Any
 import jax
 from flax import struct
 
+from carljax.ppo.kl_patience import KLPatience
 from carljax.sim.types import Observation, State
 
 
@@ -22,6 +23,8 @@ class Transition(struct.PyTreeNode):
       done: () float32, 1 where the step ended the episode.
       truncation: () float32, 1 where it ended without failure.
       weight: () float32, 0 on the step that restarts an ended episode: it carries no decision.
+      policy: (A,) alpha and (A,) beta of the policy that acted; None unless a KL is to be measured.
+      hint: () int8, what an end at this step suggests, see `hints`; None without hints.
     """
 
     obs: Observation
@@ -32,6 +35,8 @@ class Transition(struct.PyTreeNode):
     done: jax.Array
     truncation: jax.Array
     weight: jax.Array
+    policy: tuple[jax.Array, jax.Array] | None = None
+    hint: jax.Array | None = None
 
 
 class Minibatch(struct.PyTreeNode):
@@ -45,6 +50,8 @@ class Minibatch(struct.PyTreeNode):
       advantage: () normalised if the config says so.
       target: () return that the critic learns.
       weight: () sums to 1 over the whole minibatch of all devices, so that sums are means.
+      policy: as in `Transition`.
+      hint: () int8, what is suggested for this step; None without hints.
     """
 
     obs: Observation
@@ -54,6 +61,8 @@ class Minibatch(struct.PyTreeNode):
     advantage: jax.Array
     target: jax.Array
     weight: jax.Array
+    policy: tuple[jax.Array, jax.Array] | None = None
+    hint: jax.Array | None = None
 
 
 class TrainState(struct.PyTreeNode):
@@ -65,6 +74,7 @@ class TrainState(struct.PyTreeNode):
       env_state: environment states, (B,) in front, shared out over devices.
       key: () PRNG key of the run, never changed; each update folds its number into it.
       update: () int32, updates done.
+      patience: see `kl_patience`; None without that schedule.
     """
 
     params: Any
@@ -72,3 +82,4 @@ class TrainState(struct.PyTreeNode):
     env_state: State
     key: jax.Array
     update: jax.Array
+    patience: KLPatience | None = None

@@ -9,12 +9,14 @@ summed already, once per micro-batch, and the `psum` would count them again.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import optax
 
+from carljax.ppo import hints, kl_patience
 from carljax.ppo.config import PPOConfig
 from carljax.ppo.loss import loss
 from carljax.ppo.networks import ActorCritic
@@ -30,15 +32,20 @@ def make_optimizer(config: PPOConfig) -> optax.GradientTransformation:
 
 
 def learning_rate(update: jax.Array, config: PPOConfig) -> jax.Array:
-    """Returns () lr (1 - u / N) for update u, or lr."""
+    """Returns () lr (1 - u / N) for update u, or lr; see `PPOConfig.lr_schedule`."""
     rate = jnp.float32(config.learning_rate)
     if not config.anneal_lr:
         return rate
+    if config.lr_schedule == "late":
+        update = update - 1
     return rate * jnp.maximum(1.0 - update.astype(jnp.float32) / config.num_updates, 0.0)
 
 
 def flatten(batch: Transition, advantage: jax.Array) -> Minibatch:
-    """Joins time and environments to one axis of samples; the weights stay 0 or 1."""
+    """Joins time and environments to one axis of samples; the weights stay 0 or 1.
+
+    Before that, while time is an axis, hints are spread over the steps that they are for.
+    """
     samples = Minibatch(
         obs=batch.obs,
         action=batch.action,
@@ -47,6 +54,8 @@ def flatten(batch: Transition, advantage: jax.Array) -> Minibatch:
         advantage=advantage,
         target=advantage + batch.value,
         weight=batch.weight,
+        policy=batch.policy,
+        hint=None if batch.hint is None else hints.spread(batch.hint, batch.weight),
     )
     return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), samples)
 
@@ -73,7 +82,7 @@ def update(
 
     Returns:
       Parameters, optimiser state and {name: ()} means over all gradient steps of the loss's metrics
-      and of grad_norm (before clipping).
+      and of grad_norm (before clipping); with KL patience see `kl_patience.run_epochs`.
     """
     optimizer = make_optimizer(config)
     num_samples = samples.weight.shape[0]
@@ -92,8 +101,12 @@ def update(
         return jax.lax.scan(gradient_step, carry, rows)
 
     keys = jax.random.split(key, config.update_epochs)
-    (params, opt_state), metrics = jax.lax.scan(epoch, (params, opt_state), keys)
-    return params, opt_state, jax.tree.map(jnp.mean, metrics)
+    learner = (params, opt_state)
+    if config.kl_patience is not None:
+        learner, metrics = kl_patience.run_epochs(epoch, learner, keys, config.target_kl)
+        return *learner, metrics
+    learner, metrics = jax.lax.scan(epoch, learner, keys)
+    return *learner, jax.tree.map(jnp.mean, metrics)
 
 
 def minibatch_gradient(
@@ -114,7 +127,8 @@ def minibatch_gradient(
     weight = samples.weight[rows]
     advantage = samples.advantage[rows]
     if config.norm_adv:
-        advantage = normalise(advantage, weight)
+        over = sum_over_devices if config.norm_adv_scope == "all" else no_sum
+        advantage = normalise(advantage, weight, over)
     weight = weight / jnp.maximum(jax.lax.psum(jnp.sum(weight), AXIS), 1.0)
 
     def piece(rows: jax.Array, weight: jax.Array, advantage: jax.Array) -> tuple[Any, dict]:
@@ -142,19 +156,34 @@ def _sum_over(function: Any, pieces: list[jax.Array]) -> Any:
     return jax.lax.scan(add, zeros, pieces)[0]
 
 
-def normalise(advantage: jax.Array, weight: jax.Array) -> jax.Array:
-    """Shifts and scales advantages to mean 0 and (Bessel-corrected) deviation 1 over all devices.
+def sum_over_devices(x: jax.Array) -> jax.Array:
+    """Adds up a device's number with those of the others."""
+    return jax.lax.psum(x, AXIS)
+
+
+def no_sum(x: jax.Array) -> jax.Array:
+    """Leaves a device's number as it is."""
+    return x
+
+
+def normalise(
+    advantage: jax.Array,
+    weight: jax.Array,
+    total: Callable[[jax.Array], jax.Array] = sum_over_devices,
+) -> jax.Array:
+    """Shifts and scales advantages to mean 0 and (Bessel-corrected) deviation 1.
 
     Args:
       advantage: (M,) float32.
       weight: (M,) float32, 0 for samples that don't count.
+      total: `sum_over_devices`, or `no_sum` for the statistics of each device's own samples.
 
     Returns:
       (M,) float32.
     """
-    count = jax.lax.psum(jnp.sum(weight), AXIS)
-    mean = jax.lax.psum(jnp.sum(weight * advantage), AXIS) / jnp.maximum(count, 1.0)
-    squares = jax.lax.psum(jnp.sum(weight * jnp.square(advantage - mean)), AXIS)
+    count = total(jnp.sum(weight))
+    mean = total(jnp.sum(weight * advantage)) / jnp.maximum(count, 1.0)
+    squares = total(jnp.sum(weight * jnp.square(advantage - mean)))
     deviation = jnp.sqrt(squares / jnp.maximum(count - 1.0, 1.0))
     return (advantage - mean) / (deviation + 1e-8)  # source: CaRL's trainer
 

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scipy import special, stats
+from scipy import integrate, special, stats
 
 from carljax.ppo import beta
 
@@ -75,6 +75,50 @@ def test_entropy_is_scipys_summed_over_dimensions(pair):
     np.testing.assert_allclose(
         beta.entropy(alpha, beta_), expected, rtol=1e-4, atol=2e-2 if max(pair) > 100 else 1e-4
     )
+
+
+KL_PAIRS = [
+    ((1.0, 1.0), (1.0, 1.0)),
+    ((1.0, 3.0), (3.0, 1.0)),
+    ((2.5, 1.2), (2.4, 1.3)),
+    ((7.0, 7.0), (2.5, 1.0)),
+    ((40.0, 2.0), (38.0, 2.5)),
+    ((1.3, 0.7), (1.0, 1.5)),
+    ((300.0, 500.0), (290.0, 510.0)),
+]
+
+
+@pytest.mark.parametrize(("pair", "other"), KL_PAIRS, ids=str)
+def test_kl_is_the_integral_of_p_log_p_over_q(pair, other):
+    """SciPy's quadrature of SciPy's densities, in the variable t = logit x, where all is smooth."""
+    a, b, c, d = np.float64(np.float32([*pair, *other]))
+
+    def integrand(t):
+        x = special.expit(t)
+        log_p, log_q = stats.beta.logpdf(x, a, b), stats.beta.logpdf(x, c, d)
+        return np.exp(log_p) * (log_p - log_q) * x * (1.0 - x)
+
+    middle = special.logit(a / (a + b))
+    expected = sum(
+        integrate.quad(integrand, *ends, epsabs=1e-10, limit=200)[0]
+        for ends in [(middle - 30.0, middle), (middle, middle + 30.0)]
+    )
+    actual = beta.kl(*(jnp.float32([x]) for x in (a, b, c, d)))
+    assert actual.shape == (1,)
+    tolerance = 5e-4 if max(pair) > 100 else 2e-5  # terms of size 500 cancel
+    np.testing.assert_allclose(actual, [expected], rtol=1e-4, atol=tolerance)
+
+
+def test_gradients_of_kl():
+    """With respect to p: (a - c) psi'(a) - (a + b - c - d) psi'(a + b); to q: psi differences."""
+    a, b, c, d = 2.5, 1.25, 3.0, 2.0
+    args = [jnp.float32([x]) for x in (a, b, c, d)]
+    grad = jax.grad(lambda *args: beta.kl(*args)[0], argnums=(0, 2))(*args)
+    trigamma = special.polygamma(1, [a, a + b])
+    expected = (a - c) * trigamma[0] - (a + b - c - d) * trigamma[1]
+    np.testing.assert_allclose(grad[0], [expected], rtol=1e-4)
+    psi = special.digamma([c, c + d, a, a + b])
+    np.testing.assert_allclose(grad[1], [psi[0] - psi[1] - psi[2] + psi[3]], rtol=1e-4)
 
 
 def test_gradients_of_log_prob_and_entropy():

@@ -6,8 +6,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scipy import stats
+from scipy import integrate, stats
 
+from carljax.ppo import hints
 from carljax.ppo.config import PPOConfig
 from carljax.ppo.loss import loss, surrogate, value_error
 from carljax.ppo.types import Minibatch
@@ -60,18 +61,26 @@ def _oracle(outputs, columns, config):
     entropy = np.vectorize(lambda a, b: stats.beta(a, b).entropy())(alpha, beta).sum(-1).mean()
     parts = {
         "policy_loss": -gain.mean(),
-        "value_loss": 0.5 * squared.mean(),
+        "value_loss": (0.5 if config.vloss_half else 1.0) * squared.mean(),
         "entropy": entropy,
         "approx_kl": np.mean(ratio - 1.0 - log_ratio),
         "clip_frac": np.mean((ratio < low) | (ratio > high)),
     }
-    total = parts["policy_loss"] - config.ent_coef * entropy + config.vf_coef * parts["value_loss"]
+    bonus = entropy / {"sum": 1, "mean": 2}[config.entropy_reduction]
+    total = parts["policy_loss"] - config.ent_coef * bonus + config.vf_coef * parts["value_loss"]
     return total, parts
 
 
-@pytest.mark.parametrize("clip_vloss", [0.1, None], ids=["value clipped", "value not clipped"])
-def test_loss_and_metrics_equal_the_oracle(clip_vloss):
-    config = PPOConfig(clip_vloss=clip_vloss, clip_coef=0.15, ent_coef=0.03, vf_coef=0.7)
+VARIANTS = {
+    "value clipped": dict(clip_vloss=0.1),
+    "value not clipped": dict(clip_vloss=None),
+    "Roach's": dict(clip_vloss=None, vloss_half=False, entropy_reduction="mean"),
+}
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_loss_and_metrics_equal_the_oracle(variant):
+    config = PPOConfig(clip_coef=0.15, ent_coef=0.03, vf_coef=0.7, **VARIANTS[variant])
     outputs, columns = _minibatch()
     expected, expected_parts = _oracle(outputs, columns, config)
     minibatch = Minibatch(obs=None, **jax.tree.map(jnp.float32, columns))
@@ -84,9 +93,55 @@ def test_loss_and_metrics_equal_the_oracle(clip_vloss):
         np.testing.assert_allclose(parts[name], part, rtol=1e-4, atol=1e-6, err_msg=name)
 
 
-@pytest.mark.parametrize("clip_vloss", [0.1, None], ids=["value clipped", "value not clipped"])
-def test_gradient_equals_finite_differences_of_the_oracle(clip_vloss):
-    config = PPOConfig(clip_vloss=clip_vloss, clip_coef=0.15, ent_coef=0.03, vf_coef=0.7)
+def test_kl_is_that_of_the_old_policy_to_the_new_one():
+    """Mean over both actions and over the samples that count, each integrated by SciPy."""
+    outputs, columns = _minibatch()
+    rng = np.random.default_rng(5)
+    old = [x + rng.uniform(-0.4, 0.4, x.shape) for x in outputs[:2]]
+
+    def integral(*parameters):
+        def integrand(x):
+            p, q = stats.beta(*parameters[:2]), stats.beta(*parameters[2:])
+            return p.pdf(x) * (p.logpdf(x) - q.logpdf(x))
+
+        return integrate.quad(integrand, 0.0, 1.0, epsabs=1e-7)[0]
+
+    rows = np.flatnonzero(columns["weight"])[:6]
+    columns["weight"] = np.where(np.isin(np.arange(NUM), rows), 1.0 / 6.0, 0.0)
+    expected = np.mean(np.vectorize(integral)(*[x[rows] for x in (*old, *outputs[:2])]))
+    policy = tuple(jnp.float32(x) for x in old)
+    minibatch = Minibatch(obs=None, policy=policy, **jax.tree.map(jnp.float32, columns))
+    params = jax.tree.map(jnp.float32, outputs)
+    total, parts = loss(params, OutputsAsParams(), minibatch, PPOConfig())
+    np.testing.assert_allclose(parts["kl"], expected, rtol=1e-3)
+    without, _ = loss(params, OutputsAsParams(), minibatch.replace(policy=None), PPOConfig())
+    assert total == without  # it is measured, not minimised
+
+
+def test_hints_add_their_own_loss():
+    """Samples with the hint to stop: KL(Beta(a, b) || Beta(1, 1.5)) / 2 of the second action.
+
+    Here a = b = 2: with log B(1, 1.5) = log(2 / 3), log B(2, 2) = log(1 / 6), psi(2) = 1 - gamma
+    and psi(4) = 11 / 6 - gamma it is log 4 + (1 + 0.5) (1 - gamma) - 1.5 (11 / 6 - gamma)
+    = log 4 - 1.25.
+    """
+    outputs, columns = _minibatch()
+    outputs = (np.full((NUM, 2), 2.0), np.full((NUM, 2), 2.0), outputs[2])
+    plain = Minibatch(obs=None, **jax.tree.map(jnp.float32, columns))
+    is_hinted = np.arange(NUM) % 3 == 0
+    hinted = plain.replace(hint=jnp.asarray(np.where(is_hinted, hints.STOP, hints.NONE), jnp.int8))
+    params, config = jax.tree.map(jnp.float32, outputs), PPOConfig(hint_coef=0.05)
+    (total, parts), (without, _) = (
+        loss(params, OutputsAsParams(), minibatch, config) for minibatch in (hinted, plain)
+    )
+    expected = np.sum(columns["weight"][is_hinted]) * (np.log(4.0) - 1.25) / 2.0
+    np.testing.assert_allclose(parts["hint_loss"], expected, rtol=1e-4)
+    np.testing.assert_allclose(total - without, 0.05 * expected, rtol=1e-2, atol=1e-7)
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_gradient_equals_finite_differences_of_the_oracle(variant):
+    config = PPOConfig(clip_coef=0.15, ent_coef=0.03, vf_coef=0.7, **VARIANTS[variant])
     outputs, columns = _minibatch()
     minibatch = Minibatch(obs=None, **jax.tree.map(jnp.float32, columns))
     grads = jax.jit(jax.grad(lambda p: loss(p, OutputsAsParams(), minibatch, config)[0]))(

@@ -92,6 +92,12 @@ def test_initialisation_is_the_papers():
     bound = np.sqrt(2.0 * 6.0 / (9 * 32 + 9 * 64))
     largest = np.max(np.abs(params["kernel_3"]))
     assert 0.99 * bound < largest <= bound
+    # As nuPlan's, both within 1 / sqrt(9 x 32).
+    encoder = ConvEncoder(NetworkConfig(encoder="roach", layer_norm=False, conv_init="torch"))
+    params = jax.jit(encoder.init)(jax.random.key(0), _obs(1, 16).raster)["params"]
+    for name in ("kernel_3", "bias_3"):
+        largest = np.max(np.abs(params[name]))
+        assert 0.9 * 288**-0.5 < largest <= 288**-0.5
     # PyTorch's linear layer: both within 1 / sqrt(256).
     layer = Linear(128).init(jax.random.key(0), jnp.zeros((1, 256), jnp.float32))["params"]
     for name in ("kernel", "bias"):

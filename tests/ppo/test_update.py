@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 
 import fill
@@ -104,6 +105,34 @@ def test_normalised_advantages(num_devices):
     np.testing.assert_allclose(run(samples), expected, atol=1e-5)
 
 
+def test_advantages_normalised_on_each_device_by_itself():
+    """The four shares one after the other; on one device that is the whole minibatch."""
+    samples = _samples()
+    spec = PartitionSpec(update.AXIS)
+
+    def run(samples):
+        return update.normalise(samples.advantage, samples.weight, update.no_sum)
+
+    shares = np.split(np.float64(samples.advantage), 4)
+    valid = np.split(np.asarray(samples.weight) > 0, 4)
+    expected = [
+        (x - x[v].mean()) / (x[v].std(ddof=1) + 1e-8) for x, v in zip(shares, valid, strict=True)
+    ]
+    on_four = np.asarray(_on_devices(run, 4, out_specs=spec)(samples))
+    np.testing.assert_allclose(on_four, np.concatenate(expected), rtol=1e-4, atol=1e-5)
+    on_one = _on_devices(run, 1, out_specs=spec)(samples)
+    together = _on_devices(lambda s: update.normalise(s.advantage, s.weight), 4, out_specs=spec)
+    np.testing.assert_allclose(on_one, together(samples), atol=1e-5)
+    assert np.max(np.abs(on_four - on_one)) > 0.1
+
+
+def test_the_scope_of_normalisation_reaches_the_gradient():
+    alone, whole = PPOConfig(norm_adv_scope="device"), PPOConfig()
+    four, one = (float(_gradient(alone, num)[1]["policy_loss"]) for num in (4, 1))
+    np.testing.assert_allclose(one, _gradient(whole, 1)[1]["policy_loss"], rtol=1e-5)
+    assert abs(four - one) > 1e-3
+
+
 @pytest.mark.parametrize("num_devices", [1, 4])
 def test_explained_variance(num_devices):
     samples = _samples()
@@ -178,6 +207,10 @@ def test_learning_rate_falls_linearly_to_zero():
     config = PPOConfig(total_samples=1000, num_envs=10, num_steps=10, learning_rate=1e-3)
     rates = [float(update.learning_rate(jnp.int32(u), config)) for u in (0, 5, 9, 10, 11)]
     np.testing.assert_allclose(rates, [1e-3, 5e-4, 1e-4, 0.0, 0.0], atol=1e-9)
+    # lr (1 - (u - 1) / N): 1.1 lr at first, 2 / N of it in the last update, number 9
+    late = dataclasses.replace(config, lr_schedule="late")
+    rates = [float(update.learning_rate(jnp.int32(u), late)) for u in (0, 1, 6, 9, 11)]
+    np.testing.assert_allclose(rates, [1.1e-3, 1e-3, 5e-4, 2e-4, 0.0], atol=1e-9)
     constant = PPOConfig(anneal_lr=False, learning_rate=1e-3)
     assert update.learning_rate(jnp.int32(5), constant) == np.float32(1e-3)
 
