@@ -116,7 +116,7 @@ def start(policy: Policy, env: DrivingEnv, episodes: jax.Array, key: jax.Array) 
     """
 
     def one(episode: jax.Array) -> Run:
-        state = env.start_episode(episode, jax.random.fold_in(key, episode))
+        state = leaderboard.start(env, episode, jax.random.fold_in(key, episode))
         return Run(leaderboard.begin(_seen(policy, env, state)), policy.init(env))
 
     return jax.vmap(one)(episodes)
