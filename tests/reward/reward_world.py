@@ -121,3 +121,17 @@ def make_state(ego, agents, situation, step_count=0, config=CARL, **memory):
         step_count=np.int32(step_count),
         key=np.uint32(0),
     )
+
+
+def one_step(config, ego=None, agents=None, situation=None, before=None, step_count=0, **memory):
+    """The composed reward of one step; nothing around and nothing remembered unless given."""
+    ego = make_ego() if ego is None else ego
+    agents = make_agents() if agents is None else agents
+    situation = make_situation() if situation is None else situation
+    state = make_state(before or ego, agents, situation, step_count, config, **memory)
+    return compute(state, ego, agents, situation, config)
+
+
+def ends(terms):
+    """Names of the causes that hold."""
+    return {name for name, value in terms.terminated.items() if bool(value)}
