@@ -156,7 +156,7 @@ def start(policy: Policy, env: DrivingEnv, episodes: jax.Array, key: jax.Array) 
 
     def one(episode: jax.Array) -> Run:
         key_episode = jax.random.fold_in(key, episode)
-        state = env.start_episode(episode, key_episode)
+        state = leaderboard.start(env, episode, key_episode)
         memory = policy.init(env, jax.random.fold_in(key_episode, _POLICY_STREAM))
         return Run(leaderboard.begin(_seen(policy, env, state)), memory)
 

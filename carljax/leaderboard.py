@@ -35,9 +35,10 @@ EVENTS = (*COLLISIONS, *GOES_ON, *OF_SCENARIOS, *ENDS)
 # What ends an episode of training.
 HARD = (*COLLISIONS, *GOES_ON, *ENDS)
 
-# Numbers of the rules: where the ego is off its lanes, runs a light, has lost its route. The
-# defaults are the leaderboard's; a policy may have been trained with others.
-RULES = RewardConfig()
+# The rules: where the ego is off its lanes, runs a light, has lost its route. The CaRL reward looks
+# at just that, with the leaderboard's numbers by default; a policy may have been trained with
+# another.
+RULES = RewardConfig(name="carl")
 BLOCKED_S = 180.0  # s. source: CARLA leaderboard 2.0
 BLOCKED_SPEED = 0.1  # m/s. source: CARLA leaderboard 2.0
 # The route's time: so much, and for every metre that at this fraction of the speed limit.
@@ -78,8 +79,19 @@ class Drive(struct.PyTreeNode):
     time_limit_s: jax.Array
 
 
+def start(env: DrivingEnv, episode: jax.Array, key: jax.Array) -> State:
+    """The first state of an episode under the rules, without an observation.
+
+    Args:
+      env: the environment; its reward does not matter.
+      episode: () int32, row of its bank.
+      key: PRNG key of what the episode leaves open.
+    """
+    return env.replace(reward_config=RULES).start_episode(episode, key)
+
+
 def begin(state: State) -> Drive:
-    """A drive from its first state."""
+    """A drive from its first state, which is one of `start`."""
     zero = jnp.zeros((), jnp.float32)
     return Drive(
         state=state,
@@ -100,7 +112,7 @@ def advance(env: DrivingEnv, drive: Drive, action: jax.Array) -> Drive:
     """Makes one step, without an observation; a drive that has ended stays as it ended.
 
     Args:
-      env: the environment; its reward's numbers do not matter.
+      env: the environment; its reward does not matter.
       drive: before.
       action: (2,) float32 in [-1, 1].
 

@@ -229,8 +229,8 @@ def test_a_repetition_is_another_drive_of_the_same_routes(course, policy, result
 
 
 def test_what_a_policy_was_trained_to_mind_does_not_change_the_score(course, policy, result):
-    """The time limit of training is over at once, and it ends the episode when blocked for 0 s."""
-    strict = RewardConfig(blocked_s=0.0, time_limit_s=0.0, off_road_frac=0.1)
+    """Another reward, whose time limit is over at once and which ends when blocked for 0 s."""
+    strict = RewardConfig(name="roach", blocked_s=0.0, time_limit_s=0.0, off_road_frac=0.1)
     other = dataclasses.replace(course, env=course.env.replace(reward_config=strict))
     assert evaluate.evaluate(other, policy) == result
 

@@ -15,8 +15,9 @@ from helpers import once
 
 from carljax import build, checkpoint, config, metrics_log, run_dir, train
 from carljax.ppo import trainer
+from carljax.reward.config import RewardConfig
 from carljax.sim import towns
-from carljax.sim.env import METRICS
+from carljax.sim.env import metric_names
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 NUM_UPDATES = 4
@@ -108,7 +109,7 @@ def test_every_logged_number_is_explained(runs):
     text = (DOCS / "metrics.md").read_text()
     causes = set(re.findall(r"`episode/(\w+)_frac`", text))
     logged = {name for line in metrics_log.read(runs[0] / "straight") for name in line}
-    assert set(METRICS) <= logged
+    assert set(metric_names(RewardConfig())) <= logged
     for name in logged:
         explained = f"`{name}`" in text or name.removeprefix("reward/") in causes
         assert explained, name

@@ -2,7 +2,8 @@
 
 Left the town from above, north up, with route and agents (those of scenarios outlined); right the
 bird's-eye image that is the policy's input; below speed, action, the reward's terms and scenarios
-by name. NumPy and Pillow on the host.
+by name. NumPy and Pillow on the host. The terms are those of the CaRL reward, by whose terms drives
+are evaluated whatever the policy was trained with.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from carljax.render import image
-from carljax.reward.reward import SOFT_FACTORS
+from carljax.reward.carl import SOFT_FACTORS
 from carljax.sim import lights
 from carljax.sim.env import DrivingEnv
 from carljax.sim.raster_canvas import RasterConfig

@@ -1,1 +1,1 @@
-"""The CaRL reward: one file for each term, composed in `reward`."""
+"""Rewards: one file for each term, one for each reward made of them; `reward` chooses."""

@@ -66,3 +66,25 @@ def collided(
       () bool.
     """
     return jnp.any(touched(ego, agents, vehicle, z_gap))
+
+
+def collided_in_motion(
+    ego: EgoState,
+    agents: Agents,
+    vehicle: VehicleParams,
+    z_gap: jax.Array | float,
+    min_speed: jax.Array | float,
+) -> jax.Array:
+    """As `collided`, but nobody is to blame who stands. source: paper, nuPlan Specific Adaptations.
+
+    Args:
+      ego: the ego.
+      agents: the others, of any kind.
+      vehicle: the ego's box.
+      z_gap: m, height difference that keeps boxes apart.
+      min_speed: m/s below which the ego stands.
+
+    Returns:
+      () bool.
+    """
+    return collided(ego, agents, vehicle, z_gap) & (ego.speed >= min_speed)

@@ -1,5 +1,7 @@
-"""Numbers and named options of the reward. The defaults are the paper's CARLA reward.
+"""Which reward, its numbers and named options. The default is the paper's CARLA reward.
 
+What only one of the other rewards has stands beside that reward; what is here holds for all that
+make use of it.
 Numbers are pytree leaves, so a sweep over them is a `vmap`; options are static. Where the authors'
 code differs from the paper the code's way is an option, or a number said beside the paper's.
 """
@@ -8,14 +10,26 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import typing
 from typing import Literal
 
 from flax import struct
 
+from carljax.reward import checks
+from carljax.reward.carl_nuplan import CarlNuplanConfig
+from carljax.reward.roach import RoachConfig
+from carljax.reward.think2drive import Think2DriveConfig
+
+Name = Literal[
+    "carl", "carl-nuplan", "carl-nuplan-survival", "carl-nuplan-tuned", "roach", "think2drive"
+]
+
 
 class RewardConfig(struct.PyTreeNode):
-    """The CaRL reward: progress times soft factors minus a terminal penalty."""
+    """One of several rewards; docs/rewards.md has their formulas."""
 
+    name: Name = struct.field(pytree_node=False, default="carl")
+    """The reward."""
     ttc_forecast: Literal["arc", "straight"] = struct.field(pytree_node=False, default="arc")
     """Forecast for time to collision: arcs of a kinematic bicycle up to 1.0 s, or the code's
     straight lines up to 0.9 s."""
@@ -95,11 +109,17 @@ class RewardConfig(struct.PyTreeNode):
     """Steps for which a comfort violation holds."""
     # source: paper, Soft Penalties
 
+    carl_nuplan: CarlNuplanConfig = dataclasses.field(default_factory=CarlNuplanConfig)
+    """What the carl-nuplan rewards have of their own."""
+    roach: RoachConfig = dataclasses.field(default_factory=RoachConfig)
+    """What roach has of its own."""
+    think2drive: Think2DriveConfig = dataclasses.field(default_factory=Think2DriveConfig)
+    """What think2drive has of its own."""
+
     def __post_init__(self) -> None:
-        """Refuses negative numbers; leaves that are arrays are not looked into."""
-        for field in dataclasses.fields(self):
-            value = getattr(self, field.name)
-            if isinstance(value, int | float) and not value >= 0:
-                raise ValueError(f"reward.{field.name}: {value} is below the smallest allowed, 0")
-        if isinstance(self.speeding_range, int | float) and self.speeding_range == 0:
-            raise ValueError("reward.speeding_range: 0 is not above 0")
+        """Refuses unknown names and negative numbers."""
+        names = typing.get_args(Name)
+        if self.name not in names:
+            raise ValueError(f"reward.name: {self.name!r} is none of {', '.join(names)}")
+        checks.refuse_negative(self, "reward")
+        checks.refuse_zero(self, "reward", "speeding_range")

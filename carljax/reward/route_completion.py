@@ -47,3 +47,19 @@ def is_finished(route_idx: jax.Array, num_points: jax.Array) -> jax.Array:
       () bool.
     """
     return num_points - 1 - route_idx < 2
+
+
+def is_near_goal(
+    route_s: jax.Array, route_length: jax.Array, distance: jax.Array | float
+) -> jax.Array:
+    """Whether no more than a distance is left. source: the paper's reproduction of Think2Drive.
+
+    Args:
+      route_s: () m along the route.
+      route_length: () m.
+      distance: m.
+
+    Returns:
+      () bool.
+    """
+    return route_length - route_s <= distance

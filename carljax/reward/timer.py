@@ -20,3 +20,19 @@ def tick(left: jax.Array, violated: jax.Array, duration: jax.Array | int) -> jax
       int32 of the same shape.
     """
     return jnp.where(violated, duration, jnp.maximum(left - 1, 0))
+
+
+LATCHED = 500  # steps shown as left of what holds for good; the critic's inputs are scaled by it
+
+
+def latch(left: jax.Array, violated: jax.Array) -> jax.Array:
+    """Keeps a penalty up until the end of the episode. source: paper, Soft Penalties (nuPlan).
+
+    Args:
+      left: int32, from the step before.
+      violated: bool of the same shape.
+
+    Returns:
+      int32 of the same shape, `LATCHED` from the first violation on, else 0.
+    """
+    return jnp.where(violated, jnp.int32(LATCHED), left)

@@ -64,7 +64,21 @@ def forecast_straight(
       xy (5, ..., 2) m and yaw (5, ...) rad at `STRAIGHT_TIMES`.
     """
     del slip, yaw_rate
-    times = STRAIGHT_TIMES.reshape((-1,) + (1,) * yaw.ndim)
+    return _straight(STRAIGHT_TIMES, xy, yaw, speed)
+
+
+def forecast_straight_second(
+    xy: jax.Array, yaw: jax.Array, slip: jax.Array, speed: jax.Array, yaw_rate: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """As `forecast_straight`, at `ARC_TIMES`. source: the authors' code for nuPlan."""
+    del slip, yaw_rate
+    return _straight(ARC_TIMES, xy, yaw, speed)
+
+
+def _straight(
+    moments: np.ndarray, xy: jax.Array, yaw: jax.Array, speed: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    times = moments.reshape((-1,) + (1,) * yaw.ndim)
     heading = jnp.stack([jnp.cos(yaw), jnp.sin(yaw)], axis=-1)
     travel = (speed * times)[..., None]
     return xy + travel * heading, jnp.broadcast_to(yaw, times.shape[:1] + yaw.shape)

@@ -141,7 +141,7 @@ class DrivingEnv(struct.PyTreeNode):
         sim = SimState(
             ego=ego,
             agents=agents,
-            reward_state=reward.init(ego, routes.stop_kind.shape[1]),
+            reward_state=reward.init(ego, routes.stop_kind.shape[1], self.reward_config),
             episode_idx=episode_idx.astype(jnp.int32),
             route_idx=zero_idx,
             walkers=jax.tree.map(lambda x: x[episode_idx], self.bank.walkers),
@@ -159,7 +159,7 @@ class DrivingEnv(struct.PyTreeNode):
             obs=None,  # type: ignore[arg-type]
             reward=zero,
             done=zero,
-            metrics=dict.fromkeys(METRICS, zero),
+            metrics=dict.fromkeys(metric_names(self.reward_config), zero),
             info={"truncation": zero},
         )
 
@@ -219,7 +219,7 @@ class DrivingEnv(struct.PyTreeNode):
             dt,
         )
         agents, walkers = self._walk(agents, before.walkers, ego, stretch.town, key_walk)
-        seen = self._situation(ego, stretch, first, idx, clock)
+        seen = self._situation(ego, agents, stretch, first, idx, clock)
         paid, terminated, memory, terms = reward.compute(
             before, ego, agents, seen, self.vehicle, self.reward_config, dt
         )
@@ -234,10 +234,7 @@ class DrivingEnv(struct.PyTreeNode):
             step_count=before.step_count + 1,
             key=key,
         )
-        # A finished route ends for good: there is nothing left to earn, so no value is
-        # bootstrapped.
-        ended = terminated | terms.finished
-        truncated = terms.timeout & ~ended
+        ended, truncated = reward.ending(terminated, terms, self.reward_config)
         return State(
             pipeline_state=after,
             obs=None,  # type: ignore[arg-type]
@@ -284,6 +281,7 @@ class DrivingEnv(struct.PyTreeNode):
     def _situation(
         self,
         ego: EgoState,
+        agents: Agents,
         stretch: Route,
         first: jax.Array,
         idx: jax.Array,
@@ -292,6 +290,7 @@ class DrivingEnv(struct.PyTreeNode):
         return situation.situation(
             ego,
             jnp.stack([jnp.float32(self.vehicle.length), jnp.float32(self.vehicle.width)]),
+            agents,
             self.bank.road_map,
             stretch,
             first,
@@ -328,20 +327,27 @@ def ego_at(xy: jax.Array, z: jax.Array, yaw: jax.Array) -> EgoState:
     )
 
 
-ENDS = (*reward.CAUSES, "finished", "timeout")
-REWARD_METRICS = tuple(
-    f"reward/{name}" for name in ("progress", *reward.SOFT_FACTORS, *ENDS, "penalty")
-)
 EPISODE_METRICS = (
     "episode/return",
     "episode/length",
     "episode/route_completion",
     "episode/km",
-    "episode/outside_lanes_km",
     "episode/scenarios",
-    *(f"episode/{name}_frac" for name in ENDS),
 )
-METRICS = (*REWARD_METRICS, *EPISODE_METRICS, "ego/speed")
+OUTSIDE_LANES = "outside_lanes"  # the soft factor whose kilometres are logged
+
+
+def metric_names(reward_config: RewardConfig) -> tuple[str, ...]:
+    """Names of all that an environment logs; each reward has terms and ends of its own."""
+    chosen = reward.chosen(reward_config)
+    outside = (f"episode/{OUTSIDE_LANES}_km",) if OUTSIDE_LANES in chosen.soft else ()
+    return (
+        *(f"reward/{name}" for name in chosen.terms),
+        *EPISODE_METRICS,
+        *outside,
+        *(f"episode/{name}_frac" for name in chosen.ends),
+        "ego/speed",
+    )
 
 
 def _metrics(
@@ -355,16 +361,21 @@ def _metrics(
     """What is logged of a step; `episode/` values add up within an episode and hold at its end."""
     step = reward.metrics(terms)
     driven = after.ego.speed * dt / 1000.0
-    outside = jnp.where(terms.soft["outside_lanes"] < 1.0, driven, 0.0)
     completion = 100.0 * seen.route_s / seen.route_length
+    ends = (*terms.terminated, "finished", "timeout")
+    kilometres = {}
+    if OUTSIDE_LANES in terms.soft:
+        outside = jnp.where(terms.soft[OUTSIDE_LANES] < 1.0, driven, 0.0)
+        name = f"episode/{OUTSIDE_LANES}_km"
+        kilometres[name] = old[name] + outside
     return {
         **step,
-        **{f"episode/{name}_frac": step[f"reward/{name}"] for name in ENDS},
+        **kilometres,
+        **{f"episode/{name}_frac": step[f"reward/{name}"] for name in ends},
         "episode/return": old["episode/return"] + paid,
         "episode/length": after.step_count.astype(jnp.float32),
         "episode/route_completion": jnp.where(terms.finished, 100.0, completion),
         "episode/km": old["episode/km"] + driven,
-        "episode/outside_lanes_km": old["episode/outside_lanes_km"] + outside,
         "episode/scenarios": after.scenarios.num_triggered.astype(jnp.float32),
         "ego/speed": after.ego.speed,
     }

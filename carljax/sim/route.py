@@ -126,5 +126,15 @@ def advance(route: Route, route_idx: jax.Array, xy: jax.Array) -> jax.Array:
 
 def distance(route: Route, route_idx: jax.Array, xy: jax.Array) -> jax.Array:
     """() m, to the nearest of the current and the next five points."""
-    near = jnp.minimum(route_idx + jnp.arange(LOOK_AHEAD), route.num_points - 1)
+    near = _near(route, route_idx)
     return jnp.sqrt(((route.xy[near] - xy) ** 2).sum(axis=1).min())
+
+
+def nearest(route: Route, route_idx: jax.Array, xy: jax.Array) -> jax.Array:
+    """() int32, the nearest of the current and the next five points."""
+    near = _near(route, route_idx)
+    return near[((route.xy[near] - xy) ** 2).sum(axis=1).argmin()]
+
+
+def _near(route: Route, route_idx: jax.Array) -> jax.Array:
+    return jnp.minimum(route_idx + jnp.arange(LOOK_AHEAD), route.num_points - 1)

@@ -16,17 +16,27 @@ from carljax.sim.road_map import (
     nearest_lane,
 )
 from carljax.sim.route import Route
-from carljax.sim.types import LIGHT_GREEN, STOP_LIGHT, EgoState, LightClock, Situation
+from carljax.sim.types import (
+    LIGHT_GREEN,
+    STOP_LIGHT,
+    Agents,
+    EgoState,
+    LightClock,
+    Others,
+    Situation,
+)
 
 # Sample points along and across the ego's footprint, 0.6 m apart: the atlas resolves 0.5 m.
 FOOTPRINT = (9, 4)
 ON_ROUTE = 2.0  # m from the route within which the ego counts as on the route's own lane
+OTHERS_AHEAD = 40  # route points ahead on which others are looked for
 JUNCTION_LOOK_AHEAD = 18  # route points ahead at which the ego is seen to be about to enter a lane
 
 
 def situation(
     ego: EgoState,
     ego_size: jax.Array,
+    agents: Agents,
     road_map: RoadMap,
     stretch: Route,
     stretch_start: jax.Array,
@@ -38,6 +48,7 @@ def situation(
     Args:
       ego: the ego.
       ego_size: (2,) its length and width, m.
+      agents: the others.
       road_map: the map.
       stretch: window of the route around the ego.
       stretch_start: () int32, the window's first route index.
@@ -49,6 +60,7 @@ def situation(
     """
     lane = nearest_lane(road_map, stretch.town, ego.xy)
     centre = layer_bits(road_map, stretch.town, ego.xy)
+    place = route.nearest(stretch, stretch_idx, ego.xy)
     return Situation(
         lane_lateral=lane.lateral,
         lane_yaw=lane.yaw,
@@ -57,11 +69,14 @@ def situation(
         lane_in_junction=lane.in_junction,
         on_parking=(centre & LAYER_PARKING) > 0,
         off_road_frac=off_road_frac(ego, ego_size, road_map, stretch.town),
+        corner_off_road=corner_off_road(ego, ego_size, road_map, stretch.town),
         route_idx=stretch_idx + stretch_start,
         route_s=stretch.s[stretch_idx],
         route_length=stretch.length,
         route_num_points=stretch.num_points + stretch_start,
         route_distance=route.distance(stretch, stretch_idx, ego.xy),
+        route_lateral=geometry.to_frame(ego.xy, stretch.xy[place], stretch.yaw[place])[1],
+        route_yaw=stretch.yaw[place],
         speed_limit=stretch.speed_limit[stretch_idx],
         stop_s=stretch.stop_s,
         stop_xy=stretch.stop_xy,
@@ -69,6 +84,7 @@ def situation(
         stop_width=stretch.stop_width,
         stop_kind=stretch.stop_kind,
         stop_light=stop_lights(road_map, stretch, clock),
+        others=others(ego, agents, road_map, stretch, stretch_idx),
     )
 
 
@@ -96,6 +112,34 @@ def off_road_frac(
     bits = layer_bits(road_map, town, geometry.from_frame(grid, ego.xy, ego.yaw))
     drivable = (bits & (LAYER_ROAD | LAYER_PARKING | LAYER_SHOULDER)) > 0
     return 1.0 - drivable.mean(dtype=jnp.float32)
+
+
+def corner_off_road(
+    ego: EgoState, ego_size: jax.Array, road_map: RoadMap, town: jax.Array
+) -> jax.Array:
+    """(4,) bool, corners of the ego's box on neither road nor parking lane."""
+    corners = geometry.box_corners(ego.xy, ego.yaw, ego_size[0], ego_size[1])
+    return (layer_bits(road_map, town, corners) & (LAYER_ROAD | LAYER_PARKING)) == 0
+
+
+def others(
+    ego: EgoState, agents: Agents, road_map: RoadMap, stretch: Route, stretch_idx: jax.Array
+) -> Others:
+    """Looks up where the others are, on the road and ahead on the ego's route."""
+    bits = layer_bits(road_map, stretch.town, agents.xy)
+    ahead = stretch_idx + jnp.arange(OTHERS_AHEAD + 1)
+    ahead = jnp.minimum(ahead, stretch.num_points - 1)
+    apart = ((agents.xy[:, None] - stretch.xy[ahead]) ** 2).sum(axis=-1)  # (N, points)
+    nearest = ahead[jnp.argmin(apart, axis=1)]
+    offset = geometry.to_frame(agents.xy, stretch.xy[nearest], stretch.yaw[nearest])
+    begin = geometry.to_frame(ego.xy, stretch.xy[stretch_idx], stretch.yaw[stretch_idx])[0]
+    gap = stretch.s[nearest] + offset[:, 0] - (stretch.s[stretch_idx] + begin)
+    # Past the last point looked at, or beside the first, one is not on this stretch.
+    is_on = (jnp.abs(offset) < ON_ROUTE).all(axis=1) & (gap > 0.0)
+    return Others(
+        on_road=(bits & (LAYER_ROAD | LAYER_PARKING | LAYER_SHOULDER)) > 0,
+        route_gap=jnp.where(is_on, gap, jnp.inf),
+    )
 
 
 def ego_place(ego: EgoState, road_map: RoadMap, stretch: Route, stretch_idx: jax.Array) -> EgoPlace:

@@ -117,6 +117,19 @@ class Agents(struct.PyTreeNode):
         return self.kind != KIND_NONE
 
 
+class Others(struct.PyTreeNode):
+    """Where the others are on road and route.
+
+    Attributes:
+      on_road: (N,) bool, their centre is on road, parking lane or shoulder.
+      route_gap: (N,) m along the route from the ego's centre to theirs; infinity where they are not
+        on the stretch ahead.
+    """
+
+    on_road: jax.Array
+    route_gap: jax.Array
+
+
 class Situation(struct.PyTreeNode):
     """Where the ego is on road and route after a step, looked up once for all who ask.
 
@@ -128,11 +141,14 @@ class Situation(struct.PyTreeNode):
       lane_in_junction: () bool.
       on_parking: () bool, ego centre is on a parking lane.
       off_road_frac: () fraction of the ego's footprint on neither road, parking nor shoulder.
+      corner_off_road: (4,) bool, corners of its box on neither road nor parking lane.
       route_idx: () int32, last passed route point.
       route_s: () m, arc length of that point.
       route_length: () m.
       route_num_points: () int32.
       route_distance: () m, to the nearest of the current and next five route points.
+      route_lateral: () m, offset from the route at that point, positive to its left.
+      route_yaw: () rad, the route's direction there.
       speed_limit: () m/s in force.
       stop_s: (Q,) m, arc length of each stop line on the route.
       stop_xy: (Q, 2) m, centre of each stop line on the route.
@@ -140,6 +156,7 @@ class Situation(struct.PyTreeNode):
       stop_width: (Q,) m, lane width there.
       stop_kind: (Q,) int32, STOP_*; STOP_NONE pads.
       stop_light: (Q,) int32, LIGHT_* now (LIGHT_GREEN where there is no light).
+      others: where the others are, see `Others`.
     """
 
     lane_lateral: jax.Array
@@ -149,11 +166,14 @@ class Situation(struct.PyTreeNode):
     lane_in_junction: jax.Array
     on_parking: jax.Array
     off_road_frac: jax.Array
+    corner_off_road: jax.Array
     route_idx: jax.Array
     route_s: jax.Array
     route_length: jax.Array
     route_num_points: jax.Array
     route_distance: jax.Array
+    route_lateral: jax.Array
+    route_yaw: jax.Array
     speed_limit: jax.Array
     stop_s: jax.Array
     stop_xy: jax.Array
@@ -161,6 +181,7 @@ class Situation(struct.PyTreeNode):
     stop_width: jax.Array
     stop_kind: jax.Array
     stop_light: jax.Array
+    others: Others
 
 
 class History(struct.PyTreeNode):
@@ -206,7 +227,8 @@ class RewardTerms(struct.PyTreeNode):
     """One step's reward, taken apart.
 
     Attributes:
-      progress: () route completion gained, percent points.
+      added: {name: ()} what is added up, before any factor. CaRL's is the progress, the route
+        completion gained in percent points.
       soft: {name: () in [0, 1]} factors.
       terminated: {name: () bool} causes that end the episode.
       finished: () bool, the route's end was reached.
@@ -214,7 +236,7 @@ class RewardTerms(struct.PyTreeNode):
       penalty: () the terminal penalty.
     """
 
-    progress: jax.Array
+    added: dict[str, jax.Array]
     soft: dict[str, jax.Array]
     terminated: dict[str, jax.Array]
     finished: jax.Array

@@ -6,6 +6,7 @@ import jax
 import numpy as np
 
 from carljax.reward import reward
+from carljax.reward.config import RewardConfig
 from carljax.sim import lights, population
 from carljax.sim.bicycle import VehicleParams
 from carljax.sim.scenarios import script
@@ -15,11 +16,13 @@ from carljax.sim.types import (
     LIGHT_GREEN,
     STOP_NONE,
     EgoState,
+    Others,
     SimState,
     Situation,
 )
 
 VEHICLE = VehicleParams()
+CARL = RewardConfig()
 DT = 0.1
 
 
@@ -58,7 +61,15 @@ def make_agents(num=2, **fields):
     return jax.tree.map(np.asarray, empty.replace(**kept))
 
 
-def make_situation(num_lines=3, **fields):
+def make_others(num=2, **fields):
+    """Others on the road but not ahead on the route; given fields fill the first places."""
+    values = {"on_road": np.ones(num, bool), "route_gap": np.full(num, np.inf, np.float32)}
+    for name, value in fields.items():
+        values[name][: len(value)] = value
+    return Others(**values)
+
+
+def make_situation(num_lines=3, others=None, **fields):
     """On the centre of a 3.5 m lane to the east, at 100 m of a route of 1 km, no stop lines."""
     values = {
         "lane_lateral": 0.0,
@@ -68,11 +79,14 @@ def make_situation(num_lines=3, **fields):
         "lane_in_junction": False,
         "on_parking": False,
         "off_road_frac": 0.0,
+        "corner_off_road": np.zeros(4),
         "route_idx": 100,
         "route_s": 100.0,
         "route_length": 1000.0,
         "route_num_points": 1001,
         "route_distance": 0.0,
+        "route_lateral": 0.0,
+        "route_yaw": 0.0,
         "speed_limit": 10.0,
         "stop_s": np.full(num_lines, 1e6),
         "stop_xy": np.zeros((num_lines, 2)),
@@ -82,11 +96,12 @@ def make_situation(num_lines=3, **fields):
         "stop_light": np.full(num_lines, LIGHT_GREEN),
     } | fields
     kinds = dict.fromkeys(("route_idx", "route_num_points", "stop_kind", "stop_light"), np.int32)
-    kinds |= dict.fromkeys(("lane_in_junction", "on_parking"), bool)
-    return Situation(**{k: np.asarray(v, kinds.get(k, np.float32)) for k, v in values.items()})
+    kinds |= dict.fromkeys(("lane_in_junction", "on_parking", "corner_off_road"), bool)
+    arrays = {k: np.asarray(v, kinds.get(k, np.float32)) for k, v in values.items()}
+    return Situation(**arrays, others=make_others() if others is None else others)
 
 
-def make_state(ego, agents, situation, step_count=0, **memory):
+def make_state(ego, agents, situation, step_count=0, config=CARL, **memory):
     """The state before a step: nothing in the reward's memory but what `memory` says.
 
     Progress up to the situation's place is already paid.
@@ -95,7 +110,7 @@ def make_state(ego, agents, situation, step_count=0, **memory):
     return SimState(
         ego=ego,
         agents=agents,
-        reward_state=reward.init(ego, situation.stop_kind.shape[0]).replace(
+        reward_state=reward.init(ego, situation.stop_kind.shape[0], config).replace(
             **{"route_s": situation.route_s, **memory}
         ),
         episode_idx=np.int32(0),
@@ -106,3 +121,17 @@ def make_state(ego, agents, situation, step_count=0, **memory):
         step_count=np.int32(step_count),
         key=np.uint32(0),
     )
+
+
+def one_step(config, ego=None, agents=None, situation=None, before=None, step_count=0, **memory):
+    """The composed reward of one step; nothing around and nothing remembered unless given."""
+    ego = make_ego() if ego is None else ego
+    agents = make_agents() if agents is None else agents
+    situation = make_situation() if situation is None else situation
+    state = make_state(before or ego, agents, situation, step_count, config, **memory)
+    return compute(state, ego, agents, situation, config)
+
+
+def ends(terms):
+    """Names of the causes that hold."""
+    return {name for name, value in terms.terminated.items() if bool(value)}

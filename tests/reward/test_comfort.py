@@ -66,6 +66,19 @@ def test_metrics_match_scipy_for_every_history_length(num, variant):
     np.testing.assert_allclose(got, want, rtol=1e-3, atol=2e-3)
 
 
+@pytest.mark.parametrize("seed", range(6))
+def test_random_drives_match_scipy_to_a_hundred_thousandth(seed):
+    """Of each metric's limit; the samples are rounded to float32 before SciPy sees them too."""
+    rng = np.random.default_rng(seed)
+    limits = np.array([20, 9, 30, 30, 1, 3])
+    for num in (8, 11, 15):
+        samples = np.cumsum(rng.normal(size=(3, num)), axis=1) * [[0.7], [0.7], [0.03]]
+        samples = samples.astype(np.float32).astype(float)
+        got = comfort.metrics(history_of(*samples), DT)
+        want = metrics_oracle(*samples, DT)
+        np.testing.assert_allclose(got / limits, want / limits, rtol=1e-5, atol=1e-5)
+
+
 def test_pushing_a_drive_keeps_the_newest_fifteen_and_unwraps_the_yaw():
     rng = np.random.default_rng(3)
     steers, pedals = rng.uniform(0.2, 1.0, 40), rng.uniform(-0.5, 1.0, 40)

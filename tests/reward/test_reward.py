@@ -17,7 +17,7 @@ from reward_world import (
     make_state,
 )
 
-from carljax.reward import comfort, reward
+from carljax.reward import carl, comfort, reward
 from carljax.reward.config import RewardConfig
 from carljax.sim import bicycle, geometry
 
@@ -38,8 +38,8 @@ def test_plain_driving_pays_the_progress():
     np.testing.assert_allclose(value, 0.2, rtol=1e-4)
     assert not bool(terminated) and not bool(terms.finished) and not bool(terms.timeout)
     assert float(memory.route_s) == 100.0
-    assert set(terms.soft) == set(reward.SOFT_FACTORS)
-    assert set(terms.terminated) == set(reward.CAUSES)
+    assert set(terms.soft) == set(carl.SOFT_FACTORS)
+    assert set(terms.terminated) == set(carl.CAUSES)
     np.testing.assert_array_equal([float(f) for f in terms.soft.values()], np.ones(5))
 
 
@@ -104,7 +104,7 @@ def test_no_pay_for_going_back_and_forth():
 
 
 def test_a_route_starts_with_an_empty_memory():
-    memory = reward.init(make_ego(yaw=2.0), 3)
+    memory = reward.init(make_ego(yaw=2.0), 3, CONFIG)
     assert float(memory.route_s) == 0.0 and int(memory.history.num) == 0
     assert memory.stop_satisfied.shape == memory.line_crossed.shape == (3,)
     np.testing.assert_array_equal(memory.history.yaw, np.full(15, np.float32(2.0)))
@@ -275,6 +275,6 @@ def test_numbers_can_be_swept_under_vmap():
 def test_metrics_name_every_term():
     *_, terms = run()
     metrics = reward.metrics(terms)
-    names = {*reward.SOFT_FACTORS, *reward.CAUSES, "progress", "finished", "timeout", "penalty"}
+    names = {*carl.SOFT_FACTORS, *carl.CAUSES, "progress", "finished", "timeout", "penalty"}
     assert set(metrics) == {f"reward/{name}" for name in names}
     assert all(value.dtype == jnp.float32 and value.shape == () for value in metrics.values())

@@ -21,14 +21,23 @@ from carljax.reward.config import RewardConfig
 from carljax.sim.types import KIND_NONE, KIND_PEDESTRIAN, KIND_STATIC, KIND_VEHICLE
 
 
-def test_progress_is_the_percentage_of_the_route():
-    # 3 m of 1200 m: 0.25 %
-    gained = route_completion.increment(f32(100.0), f32(103.0), f32(1200.0))
-    np.testing.assert_allclose(gained, 0.25, rtol=1e-5)
+@pytest.mark.parametrize(
+    ("before", "after", "length", "expected"),
+    [
+        (100, 103, 1200, 0.25),
+        (0, 1, 1000, 0.1),
+        (998, 1000, 1000, 0.2),
+        (50, 50, 400, 0.0),
+        (0, 200, 200, 100.0),
+        (100, 90, 1200, 0.0),  # never negative
+    ],
+)
+def test_progress_is_the_percentage_of_the_route(before, after, length, expected):
+    gained = route_completion.increment(f32(before), f32(after), f32(length))
+    np.testing.assert_allclose(gained, expected, rtol=1e-5)
 
 
-def test_progress_is_never_negative():
-    assert float(route_completion.increment(f32(100.0), f32(90.0), f32(1200.0))) == 0.0
+def test_rounded_progress_is_never_negative():
     assert float(route_completion.rounded_increment(f32(100.0), f32(90.0), f32(1200.0))) == 0.0
 
 
@@ -73,14 +82,28 @@ def test_collision(fields, expected):
     assert bool(got) is expected
 
 
-@pytest.mark.parametrize(("frac", "expected"), [(0.95, False), (0.96, True), (0.0, False)])
+@pytest.mark.parametrize(
+    ("frac", "expected"),
+    [(0.0, False), (0.5, False), (0.94, False), (0.95, False), (0.96, True), (1.0, True)],
+)
 def test_off_road(frac, expected):
     assert bool(off_road.is_off_road(f32(frac), f32(0.95))) is expected
 
 
-def test_route_deviation_by_distance():
-    got = [bool(route_deviation.has_deviated(f32(d), 30.0, f32(0.0), 300.0)) for d in (29.9, 30.0)]
-    assert got == [False, True]
+@pytest.mark.parametrize(
+    ("distance", "far", "expected"),
+    [
+        (0.0, 0.0, False),
+        (29.9, 0.0, False),
+        (30.0, 0.0, True),
+        (80.0, 0.0, True),
+        (0.0, 300.0, False),
+        (0.0, 300.5, True),
+    ],
+)
+def test_route_deviation_by_distance(distance, far, expected):
+    got = route_deviation.has_deviated(f32(distance), 30.0, f32(far), 300.0)
+    assert bool(got) is expected
 
 
 def test_route_deviation_by_advance_far_from_it():
@@ -101,14 +124,40 @@ def test_blocked_after_more_than_ninety_seconds_of_standing():
     assert float(blocked.standing_time(standing, f32(0.1), 0.1, DT)) == 0.0  # moving again
 
 
-def test_timeout_after_the_limit():
-    assert not bool(timeout.is_timeout(jnp.int32(12000), 1200.0, DT))
-    assert bool(timeout.is_timeout(jnp.int32(12001), 1200.0, DT))
+@pytest.mark.parametrize(
+    ("steps", "limit", "expected"),
+    [
+        (1, 1200.0, False),
+        (12000, 1200.0, False),
+        (12001, 1200.0, True),
+        (150, 15.0, False),
+        (151, 15.0, True),
+        (1, 0.0, True),
+    ],
+)
+def test_timeout_after_the_limit(steps, limit, expected):
+    assert bool(timeout.is_timeout(jnp.int32(steps), limit, DT)) is expected
+
+
+@pytest.mark.parametrize(
+    ("before", "speed", "expected"),
+    [(0, 0.05, 0.1), (5, 0.0, 5.1), (5, 0.1, 0.0), (5, 3.0, 0.0), (89.9, 0.09, 90.0), (0, 1, 0.0)],
+)
+def test_standing_time(before, speed, expected):
+    got = blocked.standing_time(f32(before), f32(speed), 0.1, DT)
+    np.testing.assert_allclose(got, expected, atol=1e-5)
 
 
 @pytest.mark.parametrize(
     ("lateral", "on_parking", "expected"),
-    [(2.2, False, False), (-2.2, False, False), (2.3, False, True), (2.3, True, False)],
+    [
+        (0.0, False, False),
+        (2.2, False, False),
+        (-2.2, False, False),
+        (2.3, False, True),
+        (-2.3, False, True),
+        (2.3, True, False),
+    ],
 )
 def test_off_lanes_half_a_metre_past_the_edge(lateral, on_parking, expected):
     # Lane of 3.5 m: 1.75 + 0.5 = 2.25 m.
@@ -118,7 +167,14 @@ def test_off_lanes_half_a_metre_past_the_edge(lateral, on_parking, expected):
 
 @pytest.mark.parametrize(
     ("degrees", "in_junction", "expected"),
-    [(119, False, False), (121, False, True), (-121, False, True), (180, True, False)],
+    [
+        (0, False, False),
+        (119, False, False),
+        (-119, False, False),
+        (121, False, True),
+        (-121, False, True),
+        (180, True, False),
+    ],
 )
 def test_wrong_way_outside_junctions(degrees, in_junction, expected):
     # Around the seam at +-180 degrees: the lane points to 170 degrees.
@@ -134,7 +190,14 @@ def test_wrong_way_outside_junctions(degrees, in_junction, expected):
 
 @pytest.mark.parametrize(
     ("lateral", "in_junction", "expected"),
-    [(0.0, False, 1.0), (0.7, False, 0.6), (-1.4, False, 0.2), (5.0, False, 0.0), (5.0, True, 1.0)],
+    [
+        (0.0, False, 1.0),
+        (0.7, False, 0.6),
+        (-1.4, False, 0.2),
+        (1.75, False, 0.0),
+        (5.0, False, 0.0),
+        (5.0, True, 1.0),
+    ],
 )
 def test_lane_centre_factor(lateral, in_junction, expected):
     # Half a lane is 1.75 m: 0.7 / 1.75 = 0.4, 1.4 / 1.75 = 0.8.
@@ -143,7 +206,8 @@ def test_lane_centre_factor(lateral, in_junction, expected):
 
 
 @pytest.mark.parametrize(
-    ("over_kmh", "expected"), [(-20.0, 1.0), (0.0, 1.0), (2.0, 0.75), (6.0, 0.25), (9.0, 0.0)]
+    ("over_kmh", "expected"),
+    [(-20.0, 1.0), (0.0, 1.0), (2.0, 0.75), (4.0, 0.5), (6.0, 0.25), (9.0, 0.0)],
 )
 def test_speeding_factor_reaches_zero_at_eight_kmh(over_kmh, expected):
     got = speed_limit.factor(

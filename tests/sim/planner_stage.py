@@ -144,7 +144,9 @@ def _play(name, num_steps, env, sim, begin, starts):
         stretch, first = route.window(env.bank.routes, sim.episode_idx, sim.route_idx)
         idx = route.advance(stretch, sim.route_idx - first, ego.xy)
         size = jnp.stack([jnp.float32(env.vehicle.length), jnp.float32(env.vehicle.width)])
-        seen = situation.situation(ego, size, env.bank.road_map, stretch, first, idx, sim.lights)
+        seen = situation.situation(
+            ego, size, agents, env.bank.road_map, stretch, first, idx, sim.lights
+        )
         met = stop_sign.halted(ego, env.vehicle, seen, 0.1)
         crossed = stop_line.crossed(sim.ego, ego, 0.0, seen, 5.0)
         lights = sim.lights.replace(time=sim.lights.time + DT)

@@ -6,10 +6,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from carljax.reward import carl
+from carljax.reward.config import RewardConfig
 from carljax.sim import autoreset
-from carljax.sim.env import ENDS, METRICS
+from carljax.sim.env import metric_names
 
 NUM_ENVS, NUM_STEPS = 6, 200
+ENDS, METRICS = carl.REWARD.ends, metric_names(RewardConfig())
 
 
 @pytest.fixture(scope="module")

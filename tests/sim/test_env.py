@@ -9,12 +9,14 @@ import numpy as np
 import pytest
 from scripted_driver import FOLLOW, FOLLOW_BLINDLY, FULL_THROTTLE, STAND, drive_on, episodes, fetch
 
-from carljax.reward import reward
+from carljax.reward import carl
+from carljax.reward.config import RewardConfig
 from carljax.sim import town as towns_module
-from carljax.sim.env import ENDS, METRICS
+from carljax.sim.env import metric_names
 
 NUM = 6  # episodes of the small environment
-CAUSES = reward.CAUSES
+CAUSES, ENDS = carl.CAUSES, carl.REWARD.ends
+METRICS = metric_names(RewardConfig())
 
 
 def drive(env, script, speed=5.0, seed=0):
@@ -127,7 +129,7 @@ def test_rewards_are_their_terms(reckless):
     num_penalties = 0
     for path in reckless:
         m = {k: v.astype(float) for k, v in path.metrics.items()}
-        soft = np.prod([m[f"reward/{name}"] for name in reward.SOFT_FACTORS], axis=0)
+        soft = np.prod([m[f"reward/{name}"] for name in carl.SOFT_FACTORS], axis=0)
         penalised = (m["reward/collision"] > 0) | (m["reward/red_light"] > 0)
         want = m["reward/progress"] * soft - 1.0 * penalised
         first = ends(path)
@@ -162,7 +164,7 @@ def test_a_car_in_the_way_is_hit_and_costs_one(empty_env):
             continue
         num_hits += 1
         m = {k: float(v[b, last[b]]) for k, v in path.metrics.items()}
-        soft = np.prod([m[f"reward/{name}"] for name in reward.SOFT_FACTORS])
+        soft = np.prod([m[f"reward/{name}"] for name in carl.SOFT_FACTORS])
         want = m["reward/progress"] * soft - 1.0
         np.testing.assert_allclose(path.reward[b, last[b]], want, atol=1e-6)
         assert m["reward/penalty"] == 1 and m["episode/collision_frac"] == 1
@@ -228,7 +230,7 @@ def test_running_a_red_light_ends_the_episode(empty_env):
             found += sorted(names)
             if names == {"red_light"}:
                 m = {k: v[b, last[b]] for k, v in path.metrics.items()}
-                soft = np.prod([m[f"reward/{name}"] for name in reward.SOFT_FACTORS])
+                soft = np.prod([m[f"reward/{name}"] for name in carl.SOFT_FACTORS])
                 paid = path.reward[b, last[b]]
                 np.testing.assert_allclose(paid, m["reward/progress"] * soft - 1, atol=1e-5)
     assert {"red_light", "stop_sign"} <= set(found) <= {"red_light", "stop_sign", "finished"}
