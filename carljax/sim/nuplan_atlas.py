@@ -1,9 +1,10 @@
 """What nuPlan's bird's-eye view shows of a town, as pixels made once; host only.
 
-One whole number a pixel of the atlas says what lies there: whether it is drivable, on a lane's
-border or on a stop line, whose centre line crosses it, and which road blocks cover it. In junctions
-several do; each set of blocks that occurs is a cell, so whether a pixel is on a route is one
-look-up in a table of cells, which is made once for every route.
+Pixels of the atlas are of kinds: whether they are drivable, on a lane's border or on a stop line,
+whose centre line crosses them, and which road blocks cover them (in junctions several may, and a
+set of blocks that occurs is a cell). A town has some thousand kinds. So an image is a gather of
+kinds and a gather from a table of what each kind shows now; and whether a cell is on a route is
+found once for every route.
 """
 
 from __future__ import annotations
@@ -21,27 +22,26 @@ from carljax.sim.road_map import LAYER_ROAD, PIXELS_PER_METRE, RoadMap
 from carljax.sim.route import Route
 from carljax.sim.types import STOP_NONE
 
-# A pixel's number: three bits, then the lane of the centre line plus one, then the cell.
-DRIVABLE, BORDER, STOP_LINE = 1, 2, 4
-LANE_SHIFT, LANE_BITS = 3, 15
-CELL_SHIFT, CELL_BITS = LANE_SHIFT + LANE_BITS, 13
-
+DRIVABLE, BORDER, STOP_LINE = 1, 2, 4  # bits of `NuplanAtlas.kind_bits`
 _PIECES = 4  # most lanes, one behind the other, that a way through a junction is cut into
 
 
 class NuplanAtlas(struct.PyTreeNode):
-    """The pixels of M towns and the routes' cells in them.
+    """The pixels of M towns and the routes' cells in them; kinds and cells count within a town.
 
     Attributes:
-      pixels: (M, H, W) int32, see the module; lanes and cells are counted within a town.
-      first_lane: (M,) int32, each town's first row of the lane table.
-      cell_on_route: (S, C) bool, for each route of the bank the cells that it covers; cell 0 is no
-        block's.
+      pixels: (M, H, W) int32, kind of each pixel; 0 shows nothing.
+      kind_bits: (M, Q) uint8, of the constants above.
+      kind_lane: (M, Q) int32, row in the lane table of the centre line there, -1 for none.
+      kind_cell: (M, Q) int32, 0 where there is no block.
+      cell_on_route: (S, C) bool, for each route of the bank the cells that it covers.
       lane_light: (K,) int32, row of the light table that governs a junction's lane; -1 elsewhere.
     """
 
     pixels: jax.Array
-    first_lane: jax.Array
+    kind_bits: jax.Array
+    kind_lane: jax.Array
+    kind_cell: jax.Array
     cell_on_route: jax.Array
     lane_light: jax.Array
 
@@ -55,43 +55,42 @@ def build(road_map: RoadMap, routes: Route) -> NuplanAtlas:
 
     Returns:
       The atlas.
-
-    Raises:
-      ValueError: a town with more lanes or cells than a pixel's number can say.
     """
     world: Any = jax.tree.map(np.asarray, road_map)
-    num_towns = len(world.layers)
-    first_lane = np.searchsorted(world.lane_town, np.arange(num_towns))
-    made = [_town(world, town, first_lane[town]) for town in range(num_towns)]
-    cells = [blocks for _, blocks in made]
+    made = [_town(world, town) for town in range(len(world.layers))]
+    most = max(len(kinds) for _, kinds, _ in made)
+    # Unused kinds show nothing.
+    kinds = [np.pad(k, ((0, most - len(k)), (0, 0))) for _, k, _ in made]
+    bits, lane, cell = np.moveaxis(np.stack(kinds), -1, 0)
+    blocks = [b for _, _, b in made]
     route_blocks = _route_blocks(world, jax.tree.map(np.asarray, routes))
     return NuplanAtlas(
-        pixels=jnp.asarray(np.stack([pixels for pixels, _ in made]), jnp.int32),
-        first_lane=jnp.asarray(first_lane, jnp.int32),
-        cell_on_route=jnp.asarray(_on_route(cells, route_blocks, np.asarray(routes.town))),
+        pixels=jnp.asarray(np.stack([pixels for pixels, _, _ in made]), jnp.int32),
+        kind_bits=jnp.asarray(bits, jnp.uint8),
+        kind_lane=jnp.asarray(lane - 1, jnp.int32),
+        kind_cell=jnp.asarray(cell, jnp.int32),
+        cell_on_route=jnp.asarray(_on_route(blocks, route_blocks, np.asarray(routes.town))),
         lane_light=jnp.asarray(_connector_lights(world), jnp.int32),
     )
 
 
-def _town(world: Any, town: int, first_lane: int) -> tuple[np.ndarray, list[np.ndarray]]:
-    """A town's pixels, and the blocks of each of its cells."""
+def _town(world: Any, town: int) -> tuple[np.ndarray, np.ndarray, list[np.ndarray]]:
+    """A town's pixels (H, W); its kinds (Q, 3): bits, lane + 1, cell; the blocks of each cell."""
     shape, origin = world.layers[town].shape, world.origin[town].astype(float)
     left, right, row = _quads_of(world, town)
     cell, blocks = _cells(left, right, world.point_block[row], origin, shape)
-    number = np.where(world.layers[town] & LAYER_ROAD, DRIVABLE, 0)
+    bits = np.where(world.layers[town] & LAYER_ROAD, DRIVABLE, 0)
     outside = ~world.lane_in_junction[world.point_lane[row]]
     borders = np.concatenate([line[outside] for line in (left, right)])
-    number |= _filled(_thick(borders), origin, shape) * BORDER
-    number |= _filled(_stop_lines(world, town), origin, shape) * STOP_LINE
-    lane = _centre_lines(world, town, origin)
-    lane = np.where(lane >= 0, lane - first_lane + 1, 0)
-    for name, values, bits in (("lanes", lane, LANE_BITS), ("cells", cell, CELL_BITS)):
-        if values.max() >= 1 << bits:
-            raise ValueError(
-                f"env.observation nuplan: a town with {values.max()} {name} is too large, "
-                f"{(1 << bits) - 1} are allowed"
-            )
-    return number | lane << LANE_SHIFT | cell << CELL_SHIFT, blocks
+    bits |= _filled(_thick(borders), origin, shape) * BORDER
+    bits |= _filled(_stop_lines(world, town), origin, shape) * STOP_LINE
+    lane = _centre_lines(world, town, origin) + 1
+    # One number for all three, the first pixel's left over for what shows nothing.
+    number = (cell.astype(np.int64) * (lane.max() + 1) + lane) * 8 + bits
+    values, pixels = np.unique(np.append(number, 0), return_inverse=True)
+    rest = values // 8
+    kinds = np.stack([values % 8, rest % (lane.max() + 1), rest // (lane.max() + 1)], axis=-1)
+    return pixels[:-1].reshape(shape), kinds, blocks
 
 
 def _quads_of(world: Any, town: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -1,8 +1,8 @@
 """CaRL's bird's-eye view in nuPlan: nine byte channels around the ego, heading up.
 
-Source: the authors' nuPlan code, paper, nuPlan input. The map comes from one rotated gather over
-whole numbers (`nuplan_atlas`), which small tables turn into route, lights and limits; boxes are
-scattered onto the image. The authors' array has ahead along its columns; turned by a quarter it is
+Source: the authors' nuPlan code, paper, nuPlan input. The map comes from one rotated gather of
+pixel kinds (`nuplan_atlas`) and one from a table of what each kind shows now, with its lights and
+the route; boxes are scattered onto the image. The authors' array has ahead along its columns; turned by a quarter it is
 this one.
 
 Ours, not the authors': lines are 1 m wide (there 1 px), since a gather at 2 px/m could miss thinner
@@ -21,18 +21,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from carljax.sim import lights, raster_road
-from carljax.sim.nuplan_atlas import (
-    BORDER,
-    CELL_SHIFT,
-    DRIVABLE,
-    LANE_BITS,
-    LANE_SHIFT,
-    STOP_LINE,
-    NuplanAtlas,
-)
+from carljax.sim.nuplan_atlas import BORDER, DRIVABLE, STOP_LINE, NuplanAtlas
 from carljax.sim.raster_canvas import GATHER, SCATTER, RasterConfig, box_pixels, flat_index, pixel
 from carljax.sim.raster_users import BUS_SIZE, CAR_SIZE, HEIGHT_REACH, NUM_LARGE
-from carljax.sim.road_map import PIXELS_PER_METRE, RoadMap
+from carljax.sim.road_map import RoadMap
 from carljax.sim.route import Route
 from carljax.sim.types import (
     KIND_PEDESTRIAN,
@@ -58,6 +50,7 @@ CHANNELS = (
     "pedestrians",
     "ego",
 )
+LINES = ("lane_borders", "lights", "stop_lines", "speed_limits")  # the others are areas
 SPEED_MAX, WALK_SPEED_MAX = 30.0, 4.0  # m/s, of vehicles and limits, of pedestrians
 STATIC_VALUE = 127
 GREEN_VALUE, YELLOW_VALUE, RED_VALUE = 80, 170, 255
@@ -120,76 +113,86 @@ def render(
     Returns:
       (H, W, 9) uint8; row 0 is farthest ahead, column 0 farthest to the left.
     """
-    number = _static(ego, road_map, atlas, route, config)
-    lane = number >> LANE_SHIFT & ((1 << LANE_BITS) - 1)
-    table = _lane_table(road_map, atlas, clock)
-    row = atlas.first_lane[route.town] + lane - 1
-    both = table.at[jnp.maximum(row, 0)].get(**GATHER)
-    both = jnp.where(lane > 0, both, 0)
-    on_route = atlas.cell_on_route[episode_idx].at[number >> CELL_SHIFT].get(**GATHER)
-    empty = jnp.zeros_like(number)
-    planes = {
-        "drivable": 255 * (number & DRIVABLE > 0),
-        "route": 255 * on_route,
-        "lane_borders": 255 * (number & BORDER > 0),
-        "lights": both >> 8,
-        "stop_lines": 255 * (number & STOP_LINE > 0) if options.stop_lines else empty,
-        "speed_limits": both & 255,
-        "vehicles": empty,
-        "pedestrians": empty,
-        "ego": _ego_box(ego, ego_size, config),
-    }
-    image = jnp.stack([planes[name].astype(jnp.uint8) for name in CHANNELS], axis=-1)
+    table = _table(road_map, atlas, route, episode_idx, clock, options)
+    image = _static(ego, road_map, atlas, route, table, config)
     image = _road_users(image, ego, agents, config)
+    image = _ego_box(image, ego, ego_size, config)
     if options.speed_line:
         image = _speed_lines(image, ego, ego_size, agents, config)
     return image.reshape(config.height, config.width, len(CHANNELS))
 
 
-def _static(
-    ego: EgoState, road_map: RoadMap, atlas: NuplanAtlas, route: Route, config: RasterConfig
+def _table(
+    road_map: RoadMap,
+    atlas: NuplanAtlas,
+    route: Route,
+    episode_idx: jax.Array,
+    clock: LightClock,
+    options: NuplanOptions,
 ) -> jax.Array:
-    """(H * W,) int32, the number of the atlas pixel around each pixel's centre; 0 outside.
+    """(Q, 9) uint8: what each kind of pixel of the route's town shows now."""
+    bits, lane, cell = (x[route.town] for x in (atlas.kind_bits, atlas.kind_lane, atlas.kind_cell))
+    light = jnp.where(lane >= 0, atlas.lane_light[lane], -1)
+    colour = lights.colour(jnp.maximum(light, 0), clock, road_map)
+    value = jnp.where(colour == LIGHT_YELLOW, YELLOW_VALUE, GREEN_VALUE)
+    value = jnp.where(colour == LIGHT_RED, RED_VALUE, value)
+    limit = speed_value(road_map.lane_speed_limit[lane], SPEED_MAX)
+    columns = {
+        "drivable": 255 * (bits & DRIVABLE > 0),
+        "route": 255 * atlas.cell_on_route[episode_idx][cell],
+        "lane_borders": 255 * (bits & BORDER > 0),
+        "lights": jnp.where(light >= 0, value, 0),
+        "speed_limits": jnp.where(lane >= 0, limit, 0),
+    }
+    if options.stop_lines:
+        columns["stop_lines"] = 255 * (bits & STOP_LINE > 0)
+    none = jnp.zeros_like(lane)
+    return jnp.stack([columns.get(x, none).astype(jnp.uint8) for x in CHANNELS], axis=-1)
+
+
+def _static(
+    ego: EgoState,
+    road_map: RoadMap,
+    atlas: NuplanAtlas,
+    route: Route,
+    table: jax.Array,
+    config: RasterConfig,
+) -> jax.Array:
+    """(H * W, 9) uint8, what the atlas pixel around each pixel's centre shows.
 
     A coarse image looks at several places per pixel, lest it miss lines; areas need the middle.
     """
-    lane_bits = ((1 << LANE_BITS) - 1) << LANE_SHIFT
 
     def at(down: float, right: float) -> jax.Array:
         index, inside = raster_road.atlas_index(ego, road_map, route, config, down, right)
         return jnp.where(inside, atlas.pixels.reshape(-1).at[index].get(**GATHER), 0)
 
-    number = at(0.0, 0.0)
-    num = math.ceil(1.0 / config.pixels_per_metre)
-    assert PIXELS_PER_METRE == 2.0  # lines of 1 m are two pixels wide: one place a metre finds them
+    image = table.at[at(0.0, 0.0)].get(**GATHER)
+    num = math.ceil(1.0 / config.pixels_per_metre)  # lines are a metre wide
     if num > 1:
+        lines = table * np.array([name in LINES for name in CHANNELS], np.uint8)
         offsets = (np.arange(num) + 0.5) / num - 0.5
         for down in offsets:
             for right in offsets:
-                more = at(float(down), float(right))
-                number |= more & (BORDER | STOP_LINE)
-                number |= jnp.where(number & lane_bits == 0, more & lane_bits, 0)
-    return number.reshape(-1)
+                more = lines.at[at(float(down), float(right))].get(**GATHER)
+                image = jnp.maximum(image, more)
+    return image.reshape(-1, len(CHANNELS))
 
 
-def _lane_table(road_map: RoadMap, atlas: NuplanAtlas, clock: LightClock) -> jax.Array:
-    """(K,) int32: what the centre line of each lane shows, its limit + 256 * its light."""
-    colour = lights.colour(jnp.maximum(atlas.lane_light, 0), clock, road_map)
-    value = jnp.where(colour == LIGHT_YELLOW, YELLOW_VALUE, GREEN_VALUE)
-    value = jnp.where(colour == LIGHT_RED, RED_VALUE, value)
-    value = jnp.where(atlas.lane_light >= 0, value, 0)
-    return speed_value(road_map.lane_speed_limit, SPEED_MAX) + (value << 8)
-
-
-def _ego_box(ego: EgoState, size: jax.Array, config: RasterConfig) -> jax.Array:
-    """(H * W,) int32, the ego's own box: it never turns in its own frame."""
-    px = config.pixels_per_metre
-    down = jnp.arange(config.height) + 0.5 - (config.height - config.ego_from_bottom_px)
-    right = jnp.arange(config.width) + 0.5 - config.width / 2
-    inside = (jnp.abs(down) <= 0.5 * size[0] * px)[:, None] & (
-        jnp.abs(right) <= 0.5 * size[1] * px
-    )[None, :]
-    return jnp.where(inside, speed_value(ego.speed, SPEED_MAX), 0).reshape(-1)
+def _ego_box(image: jax.Array, ego: EgoState, size: jax.Array, config: RasterConfig) -> jax.Array:
+    """Draws the ego's own box."""
+    at = box_pixels(
+        ego.xy[None],
+        jnp.zeros(1, jnp.float32),
+        size[:1],
+        size[1:],
+        jnp.ones(1, bool),
+        CAR_SIZE,
+        ego,
+        config,
+    )
+    value = speed_value(ego.speed, SPEED_MAX).astype(jnp.uint8)
+    return image.at[at, _EGO].max(value, **SCATTER)
 
 
 def _shown(ego: EgoState, agents: Agents, config: RasterConfig) -> jax.Array:

@@ -53,7 +53,7 @@ WALKER_SCALE = 2.0  # of half extents
 
 # Ours. The largest box, a bus of 10.4 x 2.6 m; a route that changes lanes; walkers; m, diagonals.
 _LONGEST_VEHICLE, _LONGEST_STRETCH, _LONGEST_WALKER = 10.8, 5.2, 2.9
-_AREA_EACH = 60.0  # m^2 of image for each road user of a kind that is drawn
+_AREA_EACH = 90.0  # m^2 of image for each road user of a kind that is drawn
 _ROUTE_OVERLAP = 0.3  # m that a stretch of the route is longer at both ends, so that bends close
 _MOST_LINES = 6  # stop lines drawn, the nearest; a crossing of two lanes each way has fewer ahead
 
@@ -90,13 +90,12 @@ def render(
     Returns:
       (H, W, 15) uint8; row 0 is farthest ahead, column 0 farthest to the left.
     """
-    planes = _planes(ego, trail, route, route_idx, config)
-    users = jnp.zeros(planes.shape[1], jnp.int32)
-    for bit in range(_ROUTE_PLANE):
-        users |= planes[bit].astype(jnp.int32) << bit
-    ground = _ground(raster_road.static(ego, road_map, route, config)).astype(jnp.int32)
-    ground |= planes[_ROUTE_PLANE].astype(jnp.int32) * _ROUTE_BIT
-    image = jnp.asarray(_TABLE).at[users << _NUM_BITS | ground].get(**GATHER)
+    counts = _counts(ego, trail, route, route_idx, config)
+    index = _ground(raster_road.static(ego, road_map, route, config)).astype(jnp.int32)
+    index |= raster_spans.covered(counts, _ROUTE_PLANE) * _ROUTE_BIT
+    for plane in range(_ROUTE_PLANE):
+        index |= raster_spans.covered(counts, plane).astype(jnp.int32) << (_NUM_BITS + plane)
+    image = jnp.asarray(_TABLE).at[index].get(**GATHER)
     image = _signals(image, ego, trail, route, route_idx, config)
     return image.reshape(config.height, config.width, len(CHANNELS))
 
@@ -108,10 +107,10 @@ def _ground(bits: jax.Array) -> jax.Array:
     return road | solid << 1 | (bits & LAYER_MARK_BROKEN > 0).astype(jnp.uint8) << 2
 
 
-def _planes(
+def _counts(
     ego: EgoState, trail: Trail, route: Route, route_idx: jax.Array, config: RasterConfig
 ) -> jax.Array:
-    """(9, H * W) bool: vehicles and walkers of each moment, and the route."""
+    """Vehicles and walkers of each moment, and the route, as planes of `raster_spans.fill`."""
     past: Trail = jax.tree.map(lambda x: x[np.array(MOMENTS)], trail)
     vehicles = _users(ego, past, KIND_VEHICLE, 1.0, 0, _LONGEST_VEHICLE, config)
     walkers = _users(

@@ -75,7 +75,7 @@ def marks(
 def fill(
     marked: list[tuple[jax.Array, jax.Array]], num_planes: int, config: RasterConfig
 ) -> jax.Array:
-    """Fills planes.
+    """Fills planes: `covered` tells them apart.
 
     Args:
       marked: from `marks`.
@@ -83,7 +83,7 @@ def fill(
       config: the image's size.
 
     Returns:
-      (num_planes, H * W) bool, whether a box of that plane covers a pixel.
+      (words, H * W) uint32, in each byte how many boxes of a plane cover a pixel.
     """
     num_words = -(-num_planes // PLANES_PER_WORD)
     words = jnp.zeros(num_words * config.height * (config.width + 1), jnp.uint32)
@@ -91,12 +91,13 @@ def fill(
     add = jnp.concatenate([values.reshape(-1) for _, values in marked])
     words = words.at[at].add(add, **SCATTER)
     words = words.reshape(num_words, config.height, config.width + 1)
-    counts = jnp.cumsum(words, axis=2, dtype=jnp.uint32)[:, :, :-1].reshape(num_words, -1)
-    planes = [
-        (counts[p // PLANES_PER_WORD] >> (8 * (p % PLANES_PER_WORD))) & 255
-        for p in range(num_planes)
-    ]
-    return jnp.stack(planes) > 0
+    return jnp.cumsum(words, axis=2, dtype=jnp.uint32)[:, :, :-1].reshape(num_words, -1)
+
+
+def covered(counts: jax.Array, plane: int) -> jax.Array:
+    """(H * W,) bool, whether a box of a plane covers a pixel; counts as from `fill`."""
+    word, byte = divmod(plane, PLANES_PER_WORD)
+    return (counts[word] >> (8 * byte)) & 255 > 0
 
 
 def _between(offset: jax.Array, slope: jax.Array, half: jax.Array) -> tuple[jax.Array, jax.Array]:
