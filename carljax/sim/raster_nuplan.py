@@ -2,8 +2,8 @@
 
 Source: the authors' nuPlan code, paper, nuPlan input. The map comes from one rotated gather of
 pixel kinds (`nuplan_atlas`) and one from a table of what each kind shows now, with its lights and
-the route; boxes are scattered onto the image. The authors' array has ahead along its columns; turned by a quarter it is
-this one.
+the route; boxes are scattered onto the image. The authors' array has ahead along its columns;
+turned by a quarter it is this one.
 
 Ours, not the authors': lines are 1 m wide (there 1 px), since a gather at 2 px/m could miss thinner
 ones; where centre lines cross, the nearest one shows; of overlapping values of a channel the larger

@@ -53,7 +53,7 @@ WALKER_SCALE = 2.0  # of half extents
 
 # Ours. The largest box, a bus of 10.4 x 2.6 m; a route that changes lanes; walkers; m, diagonals.
 _LONGEST_VEHICLE, _LONGEST_STRETCH, _LONGEST_WALKER = 10.8, 5.2, 2.9
-_AREA_EACH = 90.0  # m^2 of image for each road user of a kind that is drawn
+_AREA_EACH = 60.0  # m^2 of image for each road user of a kind that is drawn
 _ROUTE_OVERLAP = 0.3  # m that a stretch of the route is longer at both ends, so that bends close
 _MOST_LINES = 6  # stop lines drawn, the nearest; a crossing of two lanes each way has fewer ahead
 

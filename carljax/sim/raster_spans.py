@@ -87,9 +87,8 @@ def fill(
     """
     num_words = -(-num_planes // PLANES_PER_WORD)
     words = jnp.zeros(num_words * config.height * (config.width + 1), jnp.uint32)
-    at = jnp.concatenate([places.reshape(-1) for places, _ in marked])
-    add = jnp.concatenate([values.reshape(-1) for _, values in marked])
-    words = words.at[at].add(add, **SCATTER)
+    for at, add in marked:  # put together first, they take XLA's CPU code seven times as long
+        words = words.at[at].add(add, **SCATTER)
     words = words.reshape(num_words, config.height, config.width + 1)
     return jnp.cumsum(words, axis=2, dtype=jnp.uint32)[:, :, :-1].reshape(num_words, -1)
 
