@@ -30,7 +30,8 @@ from carljax.ppo.rollout import rollout
 from carljax.ppo.types import Minibatch, TrainState
 from carljax.ppo.update import update
 from carljax.sim import episodes
-from carljax.sim.env import DrivingEnv, make_env
+from carljax.sim.env import DrivingEnv, ObservationKind, make_env
+from carljax.sim.observation import KINDS
 from carljax.sim.raster_canvas import RasterConfig
 from carljax.sim.town import Town
 from carljax.sim.types import State
@@ -53,6 +54,8 @@ class Command:
     """Timed calls, at least 5."""
     num_routes: int = 64
     """Routes in the bank."""
+    observation: ObservationKind = "carla"
+    """What `render` draws, at the size of the preset `cpu` and at its authors' size."""
 
 
 def main() -> int:
@@ -73,7 +76,9 @@ def measure(command: Command, config: TrainConfig, towns: list[Town]) -> Iterato
     if "sim" in command.kinds:
         yield sim(command, config, towns)
     if "render" in command.kinds:
-        for name, raster in (("cpu", presets.CPU.env.raster), ("carl-carla", RasterConfig())):
+        kind = command.observation
+        full = "carl-carla" if kind == "carla" else kind
+        for name, raster in (("cpu", presets.CPU.env.raster), (full, KINDS[kind].raster)):
             yield {"raster": name, **render(command, config, towns, raster)}
     if {"rollout", "update", "end_to_end"} & set(command.kinds):
         yield from learning(command, config, towns)
@@ -112,6 +117,8 @@ def render(
     command: Command, config: TrainConfig, towns: list[Town], raster: RasterConfig
 ) -> dict[str, Any]:
     """Observations one after the other, as in a rollout; only the ego turns a little."""
+    seen = dataclasses.replace(config.env, observation=command.observation)
+    config = dataclasses.replace(config, env=seen)
     env = small_env(command, config, towns, RENDER_AGENTS, raster)
     episodes = jnp.arange(RENDER_ENVS) % env.bank.num_episodes
 
@@ -139,6 +146,7 @@ def render(
         "num_envs": RENDER_ENVS,
         "num_steps": RENDER_STEPS,
         "num_agents": RENDER_AGENTS,
+        "observation": command.observation,
         "shape": list(state.obs.raster.shape[1:]),
     }
 

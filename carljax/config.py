@@ -126,6 +126,7 @@ class TrainConfig:
                 f"env.scenario_spacing: {spacing} is below the least allowed, 0 (no scenarios)"
             )
         try:
+            self.env.validate()
             self.ppo.validate(num_devices)
         except ValueError as error:
             raise ConfigError(str(error)) from error

@@ -9,7 +9,7 @@ import jax
 from carljax.config import RunConfig, TrainConfig
 from carljax.ppo.config import NetworkConfig, PPOConfig
 from carljax.reward.config import RewardConfig
-from carljax.sim.env import EnvConfig
+from carljax.sim.env import EnvConfig, ObservationKind
 from carljax.sim.raster_canvas import RasterConfig
 
 
@@ -171,6 +171,24 @@ PRESETS = {
     ),
     "atari": Preset("PPO as for Atari, else as carl-carla: 8 environments, 10 M.", ATARI),
 }
+
+
+def seen_as(kind: ObservationKind) -> dict[str, Preset]:
+    """The presets with another observation, each in its authors' size unless the preset says one.
+
+    Args:
+      kind: of `observation.KINDS`.
+
+    Returns:
+      Presets of the same names.
+    """
+    return {
+        name: dataclasses.replace(
+            preset,
+            config=dataclasses.replace(preset.config, env=preset.config.env.with_observation(kind)),
+        )
+        for name, preset in PRESETS.items()
+    }
 
 
 def default_name() -> str:

@@ -76,17 +76,12 @@ def parse(argv: list[str]) -> Command:
       ConfigError: `--resume` with a preset, without a run, or with another configuration.
     """
     has_preset = bool(argv) and (not argv[0].startswith("-") or argv[0] in ("-h", "--help"))
-    choices = {
-        name: (preset.description, Command(preset.config))
-        for name, preset in presets.PRESETS.items()
-    }
-    command = tyro.extras.overridable_config_cli(
-        choices,
-        args=argv if has_preset else [presets.default_name(), *argv],
-        prog=PROG,
-        description=__doc__,
-        config=(tyro.conf.FlagCreatePairsOff,),
-    )
+    given = argv if has_preset else [presets.default_name(), *argv]
+    command = _parse_fresh(given, presets.PRESETS)
+    kind = command.config.env.observation
+    if command.resume is None and kind != presets.PRESETS[given[0]].config.env.observation:
+        # Once more, so that what was not said has the values of this observation.
+        command = _parse_fresh(given, presets.seen_as(kind))
     if command.resume is None:
         return command
     if has_preset:
@@ -101,6 +96,17 @@ def parse(argv: list[str]) -> Command:
     )
     _check_same_experiment(saved, command.config)
     return dataclasses.replace(command, config=_with_run(command.config, dir=command.resume))
+
+
+def _parse_fresh(argv: list[str], named: dict[str, presets.Preset]) -> Command:
+    """Reads a command line that begins with a preset's name."""
+    return tyro.extras.overridable_config_cli(
+        {name: (preset.description, Command(preset.config)) for name, preset in named.items()},
+        args=argv,
+        prog=PROG,
+        description=__doc__,
+        config=(tyro.conf.FlagCreatePairsOff,),
+    )
 
 
 def run(command: Command, console: Console) -> int:

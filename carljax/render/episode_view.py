@@ -120,7 +120,8 @@ def frame(env: DrivingEnv, world: World, state: State, command: np.ndarray) -> I
     width = 2 * PANEL + 3 * MARGIN
     canvas = Image.new("RGB", (width, PANEL + TEXT_HEIGHT + 2 * MARGIN), BACKGROUND)
     canvas.paste(map_view(world, state), (MARGIN, MARGIN))
-    seen = policy_view(np.asarray(state.obs.raster), env.config.raster)
+    config = env.config
+    seen = policy_view(np.asarray(state.obs.raster), config.raster, config.observation)
     canvas.paste(seen, (PANEL + 2 * MARGIN + (PANEL - seen.width) // 2, MARGIN))
     draw = ImageDraw.Draw(canvas)
     _draw_numbers(draw, state, command, PANEL + 2 * MARGIN)
@@ -128,10 +129,19 @@ def frame(env: DrivingEnv, world: World, state: State, command: np.ndarray) -> I
     return canvas
 
 
-def policy_view(raster: np.ndarray, config: RasterConfig) -> Image.Image:
-    """Colours the policy's image, as large as the panel allows without distorting it."""
+def policy_view(raster: np.ndarray, config: RasterConfig, kind: str = "carla") -> Image.Image:
+    """Colours the policy's image, as large as the panel allows without distorting it.
+
+    Args:
+      raster: (H, W, C) uint8.
+      config: its size.
+      kind: of `observation.KINDS`.
+
+    Returns:
+      RGB picture.
+    """
     scale = PANEL / max(raster.shape[:2])
-    picture = image.bev_image(raster, config, scale=max(1, int(scale)))
+    picture = image.bev_image(raster, config, scale=max(1, int(scale)), kind=kind)
     size = (round(raster.shape[1] * scale), round(raster.shape[0] * scale))
     return Image.fromarray(picture).resize(size, Image.Resampling.NEAREST)
 

@@ -5,7 +5,9 @@ from __future__ import annotations
 import jax
 import numpy as np
 
-from carljax.sim.raster_canvas import CHANNELS, RasterConfig
+from carljax.sim import observation, raster_roach
+from carljax.sim.raster_canvas import RasterConfig
+from carljax.sim.raster_nuplan import STATIC_VALUE
 from carljax.sim.raster_road import GREEN_VALUE
 from carljax.sim.raster_users import LIGHTS
 from carljax.sim.road_map import (
@@ -53,14 +55,16 @@ def bev_image(
     config: RasterConfig,
     scale: int = 1,
     ego_size: tuple[float, float] = EGO_SIZE,
+    kind: str = "carla",
 ) -> np.ndarray:
     """Colours the policy's image and puts the ego in.
 
     Args:
-      raster: (H, W, 10) uint8, from `rasterizer.render`.
+      raster: (H, W, C) uint8, the image of an observation.
       config: what it was rendered with.
       scale: side of a pixel in the picture.
       ego_size: length and width, m.
+      kind: of `observation.KINDS`.
 
     Returns:
       (H * scale, W * scale, 3) uint8 RGB.
@@ -69,13 +73,20 @@ def bev_image(
       ValueError: the image hasn't the shape that the configuration says.
     """
     raster = np.asarray(raster)
-    if raster.shape != config.shape:
-        raise ValueError(
-            f"image of shape {raster.shape}, but the configuration says {config.shape}"
-        )
-    channel = {name: raster[..., i] for i, name in enumerate(CHANNELS)}
+    channels = observation.KINDS[kind].channels
+    shape = (config.height, config.width, len(channels))
+    if raster.shape != shape:
+        raise ValueError(f"image of shape {raster.shape}, but the configuration says {shape}")
     picture = np.empty((*raster.shape[:2], 3), np.uint8)
     picture[:] = GROUND
+    _PAINTERS[kind](picture, {name: raster[..., i] for i, name in enumerate(channels)})
+    picture = picture.repeat(scale, axis=0).repeat(scale, axis=1)
+    _paint_ego(picture, config, scale, ego_size)
+    return picture
+
+
+def _paint_carla(picture: np.ndarray, channel: dict[str, np.ndarray]) -> None:
+    """CaRL's channels in CARLA."""
     picture[channel["shoulder"] > 0] = SHOULDER
     picture[channel["road"] > 0] = ROAD
     picture[channel["route"] > 0] = ROUTE
@@ -83,18 +94,44 @@ def bev_image(
     picture[channel["markings"] == 255] = SOLID
     picture[channel["stop_sign"] > 0] = STOP_SIGN
     _paint_scale(picture, channel["speed_signs"], SPEED_SIGN)
-    light = channel["lights"]
-    picture[light == GREEN_VALUE] = GREEN
-    picture[(light > GREEN_VALUE) & (light < 255)] = YELLOW
-    picture[light == 255] = RED
+    _paint_lights(picture, channel["lights"])
     picture[channel["static"] > 0] = STATIC
     _paint_scale(picture, channel["vehicles"], VEHICLE)
     for bit, (value, _, _) in LIGHTS.items():
         picture[channel["vehicles"] == value] = VEHICLE_LIGHT[bit]
     _paint_scale(picture, channel["pedestrians"], PEDESTRIAN)
-    picture = picture.repeat(scale, axis=0).repeat(scale, axis=1)
-    _paint_ego(picture, config, scale, ego_size)
-    return picture
+
+
+def _paint_roach(picture: np.ndarray, channel: dict[str, np.ndarray]) -> None:
+    """Roach's channels: the older a moment the darker; of the signals the present ones."""
+    picture[channel["road"] > 0] = ROAD
+    picture[channel["route"] > 0] = ROUTE
+    picture[channel["markings"] > 0] = BROKEN
+    picture[channel["markings"] == 255] = SOLID
+    moments = raster_roach.SECONDS
+    _paint_lights(picture, channel[f"signals {moments[-1]}"])
+    for name, ends in (("vehicles", VEHICLE), ("walkers", PEDESTRIAN)):
+        low, high = np.array(ends, float)
+        for age, when in enumerate(moments, start=1):
+            colour = low + (high - low) * age / len(moments)
+            picture[channel[f"{name} {when}"] > 0] = np.round(colour * (0.4 + 0.15 * age))
+
+
+def _paint_nuplan(picture: np.ndarray, channel: dict[str, np.ndarray]) -> None:
+    """CaRL's channels in nuPlan; what stands among pedestrians is shown as an obstacle."""
+    picture[channel["drivable"] > 0] = ROAD
+    picture[channel["route"] > 0] = ROUTE
+    picture[channel["lane_borders"] > 0] = SOLID
+    _paint_scale(picture, channel["speed_limits"], SPEED_SIGN)
+    _paint_lights(picture, channel["lights"])
+    picture[channel["stop_lines"] > 0] = STOP_SIGN
+    _paint_scale(picture, channel["vehicles"], VEHICLE)
+    _paint_scale(picture, channel["pedestrians"], PEDESTRIAN)
+    picture[channel["pedestrians"] == STATIC_VALUE] = STATIC
+    picture[channel["ego"] > 0] = EGO
+
+
+_PAINTERS = {"carla": _paint_carla, "roach": _paint_roach, "nuplan": _paint_nuplan}
 
 
 def map_image(layers: np.ndarray | jax.Array, scale: int = 1) -> np.ndarray:
@@ -120,6 +157,13 @@ def map_image(layers: np.ndarray | jax.Array, scale: int = 1) -> np.ndarray:
     ):
         table[bits & layer > 0] = colour
     return table[np.asarray(layers)[::-1]].repeat(scale, axis=0).repeat(scale, axis=1)
+
+
+def _paint_lights(picture: np.ndarray, channel: np.ndarray) -> None:
+    """Colours lights (and Roach's stop signs) by their value."""
+    picture[channel == GREEN_VALUE] = GREEN
+    picture[(channel > GREEN_VALUE) & (channel < 255)] = YELLOW
+    picture[channel == 255] = RED
 
 
 def _paint_scale(picture: np.ndarray, channel: np.ndarray, ends: tuple[Colour, Colour]) -> None:

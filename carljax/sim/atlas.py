@@ -9,6 +9,7 @@ one pixel around `origin + (column, row) / PIXELS_PER_METRE`.
 from __future__ import annotations
 
 import functools
+from collections.abc import Iterator
 
 import jax
 import jax.numpy as jnp
@@ -200,6 +201,42 @@ def fill_polygons(corners: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
     Raises:
       ValueError: a polygon spans more than 64 pixels; cut it first.
     """
+    canvas = jnp.zeros(shape[0] * shape[1], jnp.bool_)
+    for _, local, first, window in _chunks(corners):
+        canvas = _fill_chunk(canvas, local, first, shape, window)
+    return np.asarray(canvas).reshape(shape)
+
+
+def covered_pixels(corners: np.ndarray, shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+    """Which polygons cover which pixels, by the rule of `fill_polygons`.
+
+    Args:
+      corners: as there.
+      shape: rows and columns.
+
+    Returns:
+      Polygon (n,) and flat pixel (n,) of each pair.
+    """
+    polygons, pixels = [np.zeros(0, int)], [np.zeros(0, int)]
+    for chosen, local, first, window in _chunks(corners):
+        inside = np.asarray(_inside(local, window))
+        polygon, row, column = np.nonzero(inside[: len(chosen)])
+        column, row = column + first[polygon, 0], row + first[polygon, 1]
+        kept = (column >= 0) & (column < shape[1]) & (row >= 0) & (row < shape[0])
+        polygons.append(chosen[polygon[kept]])
+        pixels.append((row * shape[1] + column)[kept])
+    return np.concatenate(polygons), np.concatenate(pixels)
+
+
+def _chunks(corners: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray, int]]:
+    """Parts of polygons that fit into windows of one size.
+
+    Yields:
+      Their places, and the arguments of `_fill_chunk`: corners, first pixels, window.
+
+    Raises:
+      ValueError: a polygon spans more than 64 pixels.
+    """
     snapped = np.round(np.asarray(corners, np.float64) * _SUBPIXELS).astype(np.int64)
     first = snapped.min(axis=1) // _SUBPIXELS  # (S, 2)
     size = (snapped.max(axis=1) // _SUBPIXELS - first + 1).max(axis=-1, initial=0)
@@ -208,7 +245,6 @@ def fill_polygons(corners: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
             f"a polygon of {size.max()} pixels is too large to fill (at most {_WINDOWS[-1]})"
         )
     local = (snapped - first[:, None] * _SUBPIXELS).astype(np.int32)
-    canvas = jnp.zeros(shape[0] * shape[1], jnp.bool_)
     smaller = 0
     for window in _WINDOWS:
         chosen = np.flatnonzero((size > smaller) & (size <= window))
@@ -216,14 +252,12 @@ def fill_polygons(corners: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
         for start in range(0, len(chosen), _CHUNK):
             part = chosen[start : start + _CHUNK]
             pad = ((0, _CHUNK - len(part)), (0, 0))
-            canvas = _fill_chunk(
-                canvas,
+            yield (
+                part,
                 np.pad(local[part], (*pad, (0, 0))),
                 np.pad(first[part].astype(np.int32), pad),
-                shape,
                 window,
             )
-    return np.asarray(canvas).reshape(shape)
 
 
 @functools.partial(jax.jit, static_argnames=("shape", "window"), donate_argnums=0)
@@ -244,6 +278,17 @@ def _fill_chunk(
       shape: rows and columns.
       window: px, side of the square in which every polygon lies.
     """
+    inside = _inside(corners, window)
+    column = first[:, 0, None, None] + jnp.arange(window, dtype=jnp.int32)[None, None, :]
+    row = first[:, 1, None, None] + jnp.arange(window, dtype=jnp.int32)[None, :, None]
+    on_canvas = (column >= 0) & (column < shape[1]) & (row >= 0) & (row < shape[0])
+    index = jnp.where(inside & on_canvas, row * shape[1] + column, canvas.shape[0])
+    return canvas.at[index].set(True, mode="drop")
+
+
+@functools.partial(jax.jit, static_argnames="window")
+def _inside(corners: jax.Array, window: int) -> jax.Array:
+    """(S, window, window) bool: pixels inside polygons; arguments as of `_fill_chunk`."""
     pixel = jnp.arange(window, dtype=jnp.int32) * _SUBPIXELS
     x, y = pixel[None, None, :], pixel[None, :, None]
     inside = jnp.zeros((corners.shape[0], window, window), jnp.bool_)
@@ -253,11 +298,7 @@ def _fill_chunk(
         cross = (b[:, 0] - a[:, 0]) * (y - a[:, 1]) - (x - a[:, 0]) * (b[:, 1] - a[:, 1])
         # The edge lies to the right of the pixel: half open, so a shared edge counts once.
         inside ^= spans & jnp.where(b[:, 1] > a[:, 1], cross > 0, cross < 0)
-    column = first[:, 0, None, None] + jnp.arange(window, dtype=jnp.int32)[None, None, :]
-    row = first[:, 1, None, None] + jnp.arange(window, dtype=jnp.int32)[None, :, None]
-    on_canvas = (column >= 0) & (column < shape[1]) & (row >= 0) & (row < shape[0])
-    index = jnp.where(inside & on_canvas, row * shape[1] + column, canvas.shape[0])
-    return canvas.at[index].set(True, mode="drop")
+    return inside
 
 
 def _lane_edges(lane: Lane) -> tuple[np.ndarray, np.ndarray]:

@@ -8,6 +8,7 @@ scenarios are played, pedestrians walk; then the reward looks at where everythin
 from __future__ import annotations
 
 import dataclasses
+from typing import Literal
 
 import jax
 import jax.numpy as jnp
@@ -18,6 +19,8 @@ from carljax.reward.config import RewardConfig
 from carljax.sim import (
     bicycle,
     lights,
+    nuplan_atlas,
+    observation,
     pedestrians,
     population,
     respawn,
@@ -29,7 +32,9 @@ from carljax.sim import (
 from carljax.sim.bicycle import VehicleParams
 from carljax.sim.episodes import EpisodeBank
 from carljax.sim.idm import IDMParams
-from carljax.sim.observation import observe
+from carljax.sim.nuplan_atlas import NuplanAtlas
+from carljax.sim.observation_nuplan import NuplanOptions
+from carljax.sim.observation_roach import RoachOptions
 from carljax.sim.population import Population
 from carljax.sim.raster_canvas import RasterConfig
 from carljax.sim.right_of_way import EgoPlace
@@ -46,6 +51,8 @@ from carljax.sim.types import (
     State,
     Walkers,
 )
+
+ObservationKind = Literal["carla", "roach", "nuplan"]  # of `observation.KINDS`
 
 ACTION_SIZE = 2
 # m/s^2. source: ours, brisker than the textbook's city drivers: a queue clears in a green of 10 s.
@@ -69,13 +76,49 @@ class EnvConfig:
     """Length of a route, m. source: paper, Scenario Generation"""
     scenario_spacing: float | None = 100.0
     """Metres of route for each scenario; None or 0 for none. source: paper, Scenario Generation"""
-    raster: RasterConfig = dataclasses.field(default_factory=RasterConfig)
-    """The bird's-eye view image."""
+    observation: ObservationKind = "carla"
+    """What is seen: CaRL's observation in CARLA, Roach's with its history, or CaRL's in nuPlan."""
+    raster: RasterConfig = None  # type: ignore[assignment]
+    """The bird's-eye view image; by default of the observation's own size."""
+    roach: RoachOptions = dataclasses.field(default_factory=RoachOptions)
+    """Options of the observation `roach`."""
+    nuplan: NuplanOptions = dataclasses.field(default_factory=NuplanOptions)
+    """Options of the observation `nuplan`."""
+
+    def __post_init__(self) -> None:
+        """Gives the image the size that the observation's authors gave it, where none is said."""
+        if self.raster is None:
+            object.__setattr__(self, "raster", observation.KINDS[self.observation].raster)
 
     @property
     def population(self) -> Population:
         """Who has which rows of the agents."""
         return Population(self.num_agents, self.num_scenario_slots, self.num_pedestrians)
+
+    def with_observation(self, kind: ObservationKind) -> EnvConfig:
+        """The same with another observation; an image of the old one's own size gets the new's."""
+        is_own = self.raster == observation.KINDS[self.observation].raster
+        raster = observation.KINDS[kind].raster if is_own else self.raster
+        return dataclasses.replace(self, observation=kind, raster=raster)
+
+    @property
+    def channels(self) -> tuple[str, ...]:
+        """Names of the image's channels."""
+        return observation.KINDS[self.observation].channels
+
+    def validate(self) -> None:
+        """Checks the image and that no option is for another kind of observation.
+
+        Raises:
+          ValueError: in one line, the field and what is wrong with it.
+        """
+        self.raster.validate()
+        for name, default in (("roach", RoachOptions()), ("nuplan", NuplanOptions())):
+            if self.observation != name and getattr(self, name) != default:
+                raise ValueError(
+                    f"env.{name}: these options are of --env.observation {name}, "
+                    f"which is {self.observation}"
+                )
 
 
 class DrivingEnv(struct.PyTreeNode):
@@ -87,6 +130,7 @@ class DrivingEnv(struct.PyTreeNode):
       vehicle: the ego's car.
       idm: the other drivers.
       config: sizes, static.
+      nuplan: what the observation `nuplan` draws its map from; None for the others.
     """
 
     bank: EpisodeBank
@@ -94,6 +138,7 @@ class DrivingEnv(struct.PyTreeNode):
     vehicle: VehicleParams
     idm: IDMParams
     config: EnvConfig = struct.field(pytree_node=False)
+    nuplan: NuplanAtlas | None = None
 
     @property
     def action_size(self) -> int:
@@ -155,7 +200,7 @@ class DrivingEnv(struct.PyTreeNode):
         )
         zero = jnp.zeros((), jnp.float32)
         return State(
-            pipeline_state=sim,
+            pipeline_state=observation.begin(self, sim),
             obs=None,  # type: ignore[arg-type]
             reward=zero,
             done=zero,
@@ -236,7 +281,7 @@ class DrivingEnv(struct.PyTreeNode):
         )
         ended, truncated = reward.ending(terminated, terms, self.reward_config)
         return State(
-            pipeline_state=after,
+            pipeline_state=observation.remember(self, before, after),
             obs=None,  # type: ignore[arg-type]
             reward=paid,
             done=(ended | truncated).astype(jnp.float32),
@@ -246,7 +291,7 @@ class DrivingEnv(struct.PyTreeNode):
 
     def observe(self, state: State) -> State:
         """Returns the state with what the policy and the critic see of it."""
-        return state.replace(obs=observe(self, state.pipeline_state))
+        return state.replace(obs=observation.observe(self, state.pipeline_state))
 
     def _walk(
         self, agents: Agents, walkers: Walkers, ego: EgoState, town: jax.Array, key: jax.Array
@@ -300,13 +345,29 @@ class DrivingEnv(struct.PyTreeNode):
 
 
 def make_env(bank: EpisodeBank, config: EnvConfig, reward_config: RewardConfig) -> DrivingEnv:
-    """Puts an environment together: CARLA's saloon as the ego among IDM's city drivers."""
+    """Puts an environment together: CARLA's saloon as the ego among IDM's city drivers.
+
+    Args:
+      bank: towns, routes and traffic.
+      config: sizes and the kind of observation.
+      reward_config: numbers and options of the reward.
+
+    Returns:
+      The environment.
+
+    Raises:
+      ValueError: an image without pixels or without the ego in it, or an option of another kind of
+        observation.
+    """
+    config.validate()
+    is_nuplan = config.observation == "nuplan"
     return DrivingEnv(
         bank=bank,
         reward_config=reward_config,
         vehicle=VehicleParams(),
         idm=IDMParams(accel_max=TRAFFIC_ACCEL, comfort_brake=TRAFFIC_BRAKE),
         config=config,
+        nuplan=nuplan_atlas.build(bank.road_map, bank.routes) if is_nuplan else None,
     )
 
 

@@ -1,4 +1,7 @@
-"""Where things lie on the bird's-eye view: its size, and the pixels of points and boxes."""
+"""Where things lie on the bird's-eye view: its size, and the pixels of points and boxes.
+
+`CHANNELS` are those of CaRL in CARLA; the other kinds of observation have their own.
+"""
 
 from __future__ import annotations
 
@@ -48,6 +51,7 @@ class RasterConfig:
       pixels_per_metre: resolution.
       ego_from_bottom_px: rows behind the ego's centre, which lies where four pixels meet.
       route_everywhere: draw the whole route ahead; otherwise only its parts in junctions (paper).
+        The observations `roach` and `nuplan` draw the whole route in any case.
     """
 
     height: int = 256
@@ -63,13 +67,39 @@ class RasterConfig:
 
     @property
     def num_route_points(self) -> int:
-        """Route points looked at: 150 (paper), or all that a route reaches in a smaller image.
+        """Route points looked at: 150 (paper), or all that a route reaches in a smaller image."""
+        return min(ROUTE_AHEAD, self.reach_points)
+
+    @property
+    def reach_points(self) -> int:
+        """Points, a metre apart, of a route that leaves the image.
 
         A route may wind, so half as much again as the distance to the farthest corner is taken.
         """
         ahead = max(self.height - self.ego_from_bottom_px, self.ego_from_bottom_px)
         reach = math.hypot(ahead, self.width / 2) / self.pixels_per_metre
-        return min(ROUTE_AHEAD, math.ceil(1.5 * reach))
+        return math.ceil(1.5 * reach)
+
+    def validate(self) -> None:
+        """Checks that there is an image and that the ego is in it.
+
+        Raises:
+          ValueError: in one line, the field and what is wrong with it.
+        """
+        for name in ("height", "width"):
+            if getattr(self, name) < 1:
+                raise ValueError(
+                    f"env.raster.{name}: {getattr(self, name)} is below the least allowed, 1"
+                )
+        if not 0.0 < self.pixels_per_metre < math.inf:
+            raise ValueError(
+                f"env.raster.pixels_per_metre: {self.pixels_per_metre} is not a number above 0"
+            )
+        if not 0 <= self.ego_from_bottom_px <= self.height:
+            raise ValueError(
+                f"env.raster.ego_from_bottom_px: {self.ego_from_bottom_px} puts the ego outside "
+                f"an image of {self.height} rows"
+            )
 
 
 def pixel(xy: jax.Array, ego: EgoState, config: RasterConfig) -> tuple[jax.Array, jax.Array]:

@@ -70,11 +70,36 @@ def _static_at(
     down: float,
     right: float,
 ) -> jax.Array:
-    """(H, W) uint8: the atlas at each pixel's centre, or so many pixels down and right of it.
+    """(H, W) uint8: the atlas at each pixel's centre, or so many pixels down and right of it."""
+    index, inside = atlas_index(ego, road_map, route, config, down, right)
+    bits = road_map.layers.reshape(-1).at[index].get(**GATHER)
+    return jnp.where(inside, bits & jnp.uint8(ROUTE_BIT - 1), jnp.uint8(0))
+
+
+def atlas_index(
+    ego: EgoState,
+    road_map: RoadMap,
+    route: Route,
+    config: RasterConfig,
+    down: float,
+    right: float,
+) -> tuple[jax.Array, jax.Array]:
+    """The atlas pixel under each pixel's centre, or so many pixels down and right of it.
 
     Places are fixed-point numbers, `_FRACTION_BITS` behind the point: whole steps along rows and
     columns are six times faster on a CPU than floats rounded at each pixel, and drift by less than
     a hundredth of an atlas pixel over the image.
+
+    Args:
+      ego: pose of the image.
+      road_map: gives the size of the atlases.
+      route: names the town.
+      config: size.
+      down: pixels of the image.
+      right: pixels of the image.
+
+    Returns:
+      (H, W) int32 index into a flat atlas, 0 outside it; (H, W) bool, inside it.
     """
     _, rows, columns = road_map.layers.shape
     # Iota, not constants: with constants XLA's CPU code for this gather is eight times slower.
@@ -93,9 +118,7 @@ def _static_at(
     y = (y_first - sin * row - cos * column) >> _FRACTION_BITS
     # Unsigned, a negative number is larger than any size.
     inside = (x.astype(jnp.uint32) < columns) & (y.astype(jnp.uint32) < rows)
-    index = jnp.where(inside, (route.town * rows + y) * columns + x, 0)
-    bits = road_map.layers.reshape(-1).at[index].get(**GATHER)
-    return jnp.where(inside, bits & jnp.uint8(ROUTE_BIT - 1), jnp.uint8(0))
+    return jnp.where(inside, (route.town * rows + y) * columns + x, 0), inside
 
 
 def _fixed_point(number: jax.Array) -> jax.Array:
@@ -162,10 +185,8 @@ def stop_sign(
     config: RasterConfig,
 ) -> jax.Array:
     """Draws the next stop sign that asks for a halt: a square as wide as its lane on the line."""
-    ahead = route.stop_idx - route_idx
-    asks = (ahead >= -STOP_SIGN_BEHIND) & (ahead <= STOP_SIGN_AHEAD)
-    asks &= (route.stop_kind == STOP_SIGN) & ~stop_satisfied
-    first = jnp.argmin(jnp.where(asks, ahead, STOP_SIGN_AHEAD + 1))[None]
+    asks, first = asking_stop_sign(route, route_idx, stop_satisfied)
+    first = first[None]
     index = box_pixels(
         route.stop_xy[first],
         route.stop_yaw[first] - ego.yaw,
@@ -177,6 +198,16 @@ def stop_sign(
         config,
     )
     return draw(image, index, STOP, jnp.full((1,), 255))
+
+
+def asking_stop_sign(
+    route: Route, route_idx: jax.Array, stop_satisfied: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """Which stop signs near the ego ask for a halt, (Q,) bool, and the first of them, () int32."""
+    ahead = route.stop_idx - route_idx
+    asks = (ahead >= -STOP_SIGN_BEHIND) & (ahead <= STOP_SIGN_AHEAD)
+    asks &= (route.stop_kind == STOP_SIGN) & ~stop_satisfied
+    return asks, jnp.argmin(jnp.where(asks, ahead, STOP_SIGN_AHEAD + 1)).astype(jnp.int32)
 
 
 def speed_signs(

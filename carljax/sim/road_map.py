@@ -53,6 +53,7 @@ class RoadMap(struct.PyTreeNode):
       point_xy: (P, 2) m; point_z: (P,) m; point_yaw: (P,) rad; point_width: (P,) m.
       point_speed: (P,) m/s, comfortable there in view of all bends of the lane from there on.
       point_lane: (P,) int32.
+      point_block: (P,) int32, running index of the road block it lies in (`road_blocks`).
       point_left, point_right: (P,) int32, the point of the lane beside to which traffic may change;
         -1 where there is none, in junctions and across solid lines.
       point_oncoming: (P,) int32, the nearest point of oncoming traffic beside it where a car may
@@ -98,6 +99,7 @@ class RoadMap(struct.PyTreeNode):
     point_width: jax.Array
     point_speed: jax.Array
     point_lane: jax.Array
+    point_block: jax.Array
     point_left: jax.Array
     point_right: jax.Array
     point_oncoming: jax.Array

@@ -280,6 +280,37 @@ class Walkers(struct.PyTreeNode):
     is_reckless: jax.Array
 
 
+class Trail(struct.PyTreeNode):
+    """What Roach's image shows of the last T = 16 steps, oldest first, the present one last.
+
+    Attributes:
+      xy: (T, N, 2) m; yaw: (T, N) rad; length, width: (T, N) m, of the road users then.
+      kind: (T, N) int8, KIND_*; KIND_NONE too for whoever was too far above or below the ego.
+      light: (T, Q) int8, LIGHT_* of each stop line of the route.
+      stop: (T,) int32, place among the stop lines of the sign that asked for a halt, -1 for none.
+    """
+
+    xy: jax.Array
+    yaw: jax.Array
+    length: jax.Array
+    width: jax.Array
+    kind: jax.Array
+    light: jax.Array
+    stop: jax.Array
+
+
+class PastMotion(struct.PyTreeNode):
+    """What nuPlan's scalars need of the ego one step ago.
+
+    Attributes:
+      steer: () in [-1, 1], applied then.
+      yaw_rate: () rad/s.
+    """
+
+    steer: jax.Array
+    yaw_rate: jax.Array
+
+
 class SimState(struct.PyTreeNode):
     """The whole state of one environment: a few kB, no map and no image.
 
@@ -293,6 +324,8 @@ class SimState(struct.PyTreeNode):
       lights: see above.
       step_count: () int32.
       key: () PRNG key.
+      past: what the observation shows of earlier steps; None (no arrays) unless `EnvConfig`'s kind
+        of observation shows any.
     """
 
     ego: EgoState
@@ -305,15 +338,16 @@ class SimState(struct.PyTreeNode):
     lights: LightClock
     step_count: jax.Array
     key: jax.Array
+    past: Trail | PastMotion | None = None
 
 
 class Observation(struct.PyTreeNode):
-    """What the policy sees.
+    """What the policy sees; sizes and meaning depend on `EnvConfig.observation`.
 
     Attributes:
-      raster: (H, W, C) uint8.
-      scalars: (8,) steer, throttle, brake, gear, v_x, v_y, forward speed, speed limit (m/s).
-      value_scalars: (10,) seen by the critic only.
+      raster: (H, W, C) uint8, row 0 farthest ahead, column 0 farthest to the left.
+      scalars: (F,).
+      value_scalars: (G,) seen by the critic only.
     """
 
     raster: jax.Array
