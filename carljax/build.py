@@ -63,10 +63,12 @@ def setup(config: TrainConfig) -> Setup:
         raise ConfigError(f"run.num_devices: {error}") from error
     config.validate(mesh.size)
     loaded = load_towns(config.run.maps)
-    if config.run.routes:
-        training = environment_on(config, loaded, read_banks(config, loaded), config.run.seed)
+    run = config.run
+    seed = run.seed if run.routes_seed is None else run.routes_seed
+    if run.routes:
+        training = environment_on(config, loaded, read_banks(config, loaded), seed)
     else:
-        training = environment(config, loaded, config.run.num_routes, config.run.seed)
+        training = environment(config, loaded, run.num_routes, seed)
     training = trainer.replicate(training, mesh)
     return Setup(config, loaded, training, ActorCritic(config.network), mesh)
 

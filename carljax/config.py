@@ -42,6 +42,8 @@ class RunConfig:
     """Run directory; by default a new one, runs/DATE-TIME."""
     seed: int = 0
     """Seed of parameters, training routes, traffic and exploration."""
+    routes_seed: int | None = None
+    """Seed of the training routes, where runs of several seeds share them. None: run.seed."""
     maps: Annotated[
         tuple[Path, ...],
         tyro.conf.UseAppendAction,
@@ -86,13 +88,16 @@ class RunConfig:
         least |= {"keep_checkpoints": 1, "best_window": 1, "eval_routes": 0}
         if self.num_devices is not None:
             least["num_devices"] = 1
+        if self.routes_seed is not None:
+            least["routes_seed"] = 0
         for name, minimum in least.items():
             if getattr(self, name) < minimum:
                 raise ConfigError(
                     f"run.{name}: {getattr(self, name)} is below the least allowed, {minimum}"
                 )
-        if self.seed == HELD_OUT_SEED:
-            raise ConfigError(f"run.seed: {self.seed} is the seed of the held-out routes")
+        for name in ("seed", "routes_seed"):
+            if getattr(self, name) == HELD_OUT_SEED:
+                raise ConfigError(f"run.{name}: {HELD_OUT_SEED} is the seed of the held-out routes")
 
 
 @dataclasses.dataclass(frozen=True)

@@ -44,15 +44,15 @@ def learn(made: Setup, state: TrainState, path: Path, console: Console) -> Train
     with (
         MetricsLog(path, start) as log,
         Report(console, start, ppo.num_updates) as report,
-        _interrupts() as interrupted,
+        interrupts() as interrupted,
     ):
         since, before = time.perf_counter(), start
         for update in range(start + 1, ppo.num_updates + 1):
             state, on_device = train_step(made.env, state)
             if update % run.log_every == 0 or update in (start + 1, ppo.num_updates):
-                metrics = _on_host(on_device)
+                metrics = on_host(on_device)
                 seconds = time.perf_counter() - since
-                metrics |= _speed(seconds, (update - before) * ppo.batch_size, update == start + 1)
+                metrics |= speed(seconds, (update - before) * ppo.batch_size, update == start + 1)
                 since, before = time.perf_counter(), update
                 log.write(update, update * ppo.batch_size, metrics)
                 window.add(metrics[SCORE])
@@ -65,7 +65,7 @@ def learn(made: Setup, state: TrainState, path: Path, console: Console) -> Train
     return state
 
 
-def _on_host(on_device: Mapping[str, jax.Array]) -> dict[str, float]:
+def on_host(on_device: Mapping[str, jax.Array]) -> dict[str, float]:
     """Fetches metrics; means over episodes are NaN where none ended."""
     metrics = {name: float(value) for name, value in jax.device_get(on_device).items()}
     if metrics["episode/num"] == 0:
@@ -75,7 +75,7 @@ def _on_host(on_device: Mapping[str, jax.Array]) -> dict[str, float]:
     return metrics
 
 
-def _speed(seconds: float, samples: int, is_first: bool) -> dict[str, float]:
+def speed(seconds: float, samples: int, is_first: bool) -> dict[str, float]:
     """Names the time taken: the first update's is mostly compilation."""
     if is_first:
         return {"time/first_update_s": seconds}
@@ -83,7 +83,7 @@ def _speed(seconds: float, samples: int, is_first: bool) -> dict[str, float]:
 
 
 @contextmanager
-def _interrupts() -> Iterator[list[int]]:
+def interrupts() -> Iterator[list[int]]:
     """Collects the first SIGINT or SIGTERM in a list, after which they act as usual again."""
     received: list[int] = []
     kinds = (signal.SIGINT, signal.SIGTERM)

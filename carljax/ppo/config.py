@@ -21,6 +21,8 @@ class NetworkConfig:
     conv_init: Literal["xavier", "torch"] = "xavier"
     """First values of the convolutions: Xavier with bias 0.1 (Roach, CaRL on CARLA), or PyTorch's
     default (CaRL on nuPlan)."""
+    asymmetric_critic: bool = True
+    """Show the critic, and it alone, the numbers of `Observation.value_scalars`; Roach does not."""
     beta_min: float = 1.0
     """Lower bound of the Beta parameters; 1 keeps the density finite, Roach used 0."""
     hidden_size: int = 256

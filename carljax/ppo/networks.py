@@ -65,8 +65,9 @@ class ActorCritic(nn.Module):
         policy = Mlp(config, head, name="policy_mlp")(features)
         alpha = nn.softplus(Linear(self.action_size, name="alpha")(policy)) + config.beta_min
         beta = nn.softplus(Linear(self.action_size, name="beta")(policy)) + config.beta_min
-        critic_input = jnp.concatenate([features, obs.value_scalars], axis=-1)
-        critic = Mlp(config, head, name="value_mlp")(critic_input)
+        if config.asymmetric_critic:
+            features = jnp.concatenate([features, obs.value_scalars], axis=-1)
+        critic = Mlp(config, head, name="value_mlp")(features)
         return alpha, beta, Linear(1, name="value")(critic)[..., 0]
 
 

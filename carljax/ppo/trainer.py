@@ -121,22 +121,73 @@ def make_train_step(network: ActorCritic, config: PPOConfig, mesh: Mesh) -> Trai
       ValueError: sizes that don't divide evenly.
     """
     config.validate(mesh.size)
+    # Said outright: on one device the compiler would call the result's sharding by another name
+    # than that of the first state, and the second call would compile once more.
+    out = (shardings(mesh), NamedSharding(mesh, PartitionSpec()))
+    options = compiler_options(mesh.devices.flat[0].platform)
+    step = _sharded_step(network, config, mesh)
+    return jax.jit(step, donate_argnums=1, out_shardings=out, compiler_options=options)
+
+
+def make_seeds_step(network: ActorCritic, config: PPOConfig, mesh: Mesh) -> TrainStep:
+    """Compiles one PPO iteration of several independent runs, which share the environment's bank.
+
+    Args:
+      network: actor and critic.
+      config: see `PPOConfig`.
+      mesh: see `make_mesh`.
+
+    Returns:
+      As `make_train_step`, with an axis of runs in front of the training state (see `stack`) and of
+      the metrics.
+
+    Raises:
+      ValueError: sizes that don't divide evenly.
+    """
+    config.validate(mesh.size)
+    out = (_with_runs(shardings(mesh)), NamedSharding(mesh, PartitionSpec()))
+    options = compiler_options(mesh.devices.flat[0].platform)
+    step = jax.vmap(_sharded_step(network, config, mesh), in_axes=(None, 0))
+    return jax.jit(step, donate_argnums=1, out_shardings=out, compiler_options=options)
+
+
+def stack(states: Sequence[TrainState], mesh: Mesh) -> TrainState:
+    """Puts training states side by side for `make_seeds_step`: a new axis in front."""
+    join = jax.jit(
+        lambda *states: jax.tree.map(lambda *x: jnp.stack(x), *states),
+        out_shardings=_with_runs(shardings(mesh)),
+    )
+    return join(*states)
+
+
+def unstack(state: TrainState, mesh: Mesh) -> list[TrainState]:
+    """Takes `stack` apart."""
+    pick = jax.jit(
+        lambda state, i: jax.tree.map(lambda x: x[i], state), out_shardings=shardings(mesh)
+    )
+    return [pick(state, i) for i in range(state.update.shape[0])]
+
+
+def _with_runs(places: TrainState) -> TrainState:
+    """Shardings with an axis in front that is shared out over no devices."""
+    return jax.tree.map(
+        lambda place: NamedSharding(place.mesh, PartitionSpec(None, *place.spec)), places
+    )
+
+
+def _sharded_step(network: ActorCritic, config: PPOConfig, mesh: Mesh) -> TrainStep:
+    """One PPO iteration over all devices, not yet compiled."""
     local = functools.partial(_local_step, network=network, config=config)
     # Without check_vma a simulator may start its inner loops from constants, which vary over no
     # device. Nothing here rests on it: no collective is differentiated, and a test compares 1 and
     # 4 devices.
-    sharded = jax.shard_map(
+    return jax.shard_map(
         local,
         mesh=mesh,
         in_specs=(PartitionSpec(), _SPEC),
         out_specs=(_SPEC, PartitionSpec()),
         check_vma=False,
     )
-    options = compiler_options(mesh.devices.flat[0].platform)
-    # Said outright: on one device the compiler would call the result's sharding by another name
-    # than that of the first state, and the second call would compile once more.
-    out = (shardings(mesh), NamedSharding(mesh, PartitionSpec()))
-    return jax.jit(sharded, donate_argnums=1, out_shardings=out, compiler_options=options)
 
 
 def _local_step(
