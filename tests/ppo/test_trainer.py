@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from pathlib import Path
 
 import chex
 import jax
@@ -10,10 +11,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import toy_env
+from jax.sharding import PartitionSpec
 
-from carljax.ppo import trainer
+from carljax.ppo import trainer, update
 from carljax.ppo.config import NetworkConfig, PPOConfig
 from carljax.ppo.networks import ActorCritic
+from carljax.ppo.types import Minibatch
 
 NETWORK = ActorCritic(
     NetworkConfig(
@@ -140,6 +143,49 @@ def test_metrics_are_scalars_of_these_names(one_device):
     for metric in metrics.values():
         assert metric.shape == ()
         assert metric.dtype == jnp.float32
+
+
+def test_every_number_of_the_learner_is_explained_with_what_is_healthy():
+    """Those that come with an option too: each has a row that says what it is, and a second one."""
+    config = dataclasses.replace(CONFIG, kl_patience=8, hint_coef=0.05, micro_batch_size=None)
+    samples = jax.eval_shape(_samples_with_everything)
+    keys, rate = jax.random.key(0), jnp.float32(0.0)
+    optimizer = update.make_optimizer(config)
+
+    def learn(samples):
+        params = NETWORK.init(keys, samples.obs)
+        return update.update(params, optimizer.init(params), samples, keys, rate, NETWORK, config)[
+            2
+        ]
+
+    spec = PartitionSpec()
+    names = jax.eval_shape(
+        jax.shard_map(
+            learn, mesh=trainer.make_mesh(1), in_specs=spec, out_specs=spec, check_vma=False
+        ),
+        samples,
+    )
+    text = (Path(__file__).resolve().parents[2] / "docs" / "metrics.md").read_text()
+    for name in (*names, "explained_variance", "learning_rate"):
+        assert text.count(f"\n| `ppo/{name}` |") == 2, name
+
+
+def _samples_with_everything(num=4):
+    env = toy_env.make()
+    obs = jax.eval_shape(lambda: env.observe(env.start(jax.random.key(0))).obs)
+    zeros = jnp.zeros(num, jnp.float32)
+    pair = jnp.ones((num, 2), jnp.float32)
+    return Minibatch(
+        obs=jax.tree.map(lambda x: jnp.zeros((num, *x.shape), x.dtype), obs),
+        action=0.5 * pair,
+        log_prob=zeros,
+        value=zeros,
+        advantage=zeros,
+        target=zeros,
+        weight=zeros,
+        policy=(pair, pair),
+        hint=jnp.zeros(num, jnp.int8),
+    )
 
 
 def test_resumed_run_is_the_same_bit_for_bit(one_device):
