@@ -197,6 +197,20 @@ def test_the_compile_cache_goes_where_it_is_asked_to(tmp_path, monkeypatch):
     assert asked == [("jax_compilation_cache_dir", str(tmp_path / "here"))]
 
 
+@pytest.mark.parametrize("kind", ["roach", "nuplan"])
+def test_other_observations_train_save_and_go_on(kind, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(build, "environment", once(build.environment))
+    tiny = [*TINY, "--env.observation", kind, "--run.dir", "run", "--ppo.total-samples"]
+    assert train.main([*tiny, "16"]) == 0
+    again = ["--resume", "run", "--ppo.total-samples", "32", "--run.eval-routes", "1"]
+    assert train.main(again) == 0
+    lines = metrics_log.read(tmp_path / "run")
+    assert [line["update"] for line in lines] == [1, 2]
+    assert all(np.isfinite(line["rollout/value"]) for line in lines)
+    assert (tmp_path / "run" / "evaluation.json").exists()
+
+
 def test_a_preset_can_be_named_and_changed():
     values = train.parse(["atari", "--ppo.learning-rate", "1e-3", "--run.seed", "7"]).config
     assert (values.ppo.num_envs, values.ppo.learning_rate, values.run.seed) == (8, 1e-3, 7)
