@@ -64,15 +64,13 @@ ATARI = dataclasses.replace(
     run=RunConfig(num_routes=4096, checkpoint_every=500),
 )
 
-# What the two columns below see and are paid for. This is the place where their observation and
-# reward are chosen; Roach's view is 192 px at 5 px/m, 30 m ahead, 8 m behind, 19.2 m to each side.
-# source: the authors' code and Roach's
-ROACH_ENV = EnvConfig(
-    raster=RasterConfig(height=192, width=192, pixels_per_metre=5.0, ego_from_bottom_px=40)
-)
-ROACH_REWARD = RewardConfig()
-NUPLAN_ENV = EnvConfig()
-NUPLAN_REWARD = RewardConfig()
+# What the columns below see and are paid for. source: Roach's code; the authors' code, whose run of
+# 1 B has the additive reward
+ROACH_ENV = EnvConfig(observation="roach")
+ROACH_REWARD = RewardConfig(name="roach")
+NUPLAN_ENV = EnvConfig(observation="nuplan")
+NUPLAN_REWARD = RewardConfig(name="carl-nuplan-survival")
+NUPLAN_TUNED_REWARD = RewardConfig(name="carl-nuplan-tuned")
 
 # source: CaRL paper, table of PPO hyperparameters, column Roach; what the table leaves open (KL
 # patience, targets of the hints, loss terms, initialisation, the mode as action) from Roach's code.
@@ -80,7 +78,7 @@ NUPLAN_REWARD = RewardConfig()
 ROACH = TrainConfig(
     env=ROACH_ENV,
     reward=ROACH_REWARD,
-    network=NetworkConfig(encoder="roach", layer_norm=False, beta_min=0.0),
+    network=NetworkConfig(encoder="roach", layer_norm=False, asymmetric_critic=False, beta_min=0.0),
     ppo=PPOConfig(
         total_samples=10_000_000,
         num_envs=6,
@@ -127,6 +125,7 @@ CARL_NUPLAN = TrainConfig(
 # source: the same column, 1 B
 CARL_NUPLAN_1B = dataclasses.replace(
     CARL_NUPLAN,
+    reward=NUPLAN_TUNED_REWARD,
     ppo=dataclasses.replace(CARL_NUPLAN.ppo, total_samples=1_000_000_000, num_envs=1024),
 )
 
@@ -163,11 +162,13 @@ PRESETS = {
         "The paper's CARLA column: 256 px, seven convolutions, 300 M.", CARL_CARLA
     ),
     "carl-nuplan": Preset(
-        "PPO and network of the paper's nuPlan column: 512 environments, 500 M.", CARL_NUPLAN
+        "The paper's nuPlan column: its view and reward, 512 environments, 500 M.", CARL_NUPLAN
     ),
-    "carl-nuplan-1b": Preset("The same with 1,024 environments, 1 B.", CARL_NUPLAN_1B),
+    "carl-nuplan-1b": Preset(
+        "The same with the tuned reward and 1,024 environments, 1 B.", CARL_NUPLAN_1B
+    ),
     "roach": Preset(
-        "PPO and network of Roach: KL patience, exploration hints, 6 environments, 10 M.", ROACH
+        "Roach: its view and reward, KL patience, exploration hints, 6 environments, 10 M.", ROACH
     ),
     "atari": Preset("PPO as for Atari, else as carl-carla: 8 environments, 10 M.", ATARI),
 }

@@ -16,14 +16,17 @@ from carljax.ppo import beta
 
 NUM_STEPS = 100  # before the end that carry its hint. source: Roach's code
 
-# Hints; of several causes at once the later in this order counts. source: Roach's code
+# Hints; of several causes at once the later in this order counts. source: Roach's code; the last
+# ones of a kind are those of the reward `roach`
 NONE, GO, GO_AND_TURN, STOP = range(4)
 RULES = (
     ("blocked", GO),
     ("route_deviation", GO_AND_TURN),
+    ("lateral_distance", GO_AND_TURN),
     ("red_light", STOP),
     ("stop_sign", STOP),
     ("collision", STOP),
+    ("pedestrian_overlap", STOP),
 )
 
 # For each hint, of steering and of throttle or brake: whether it says anything, and the target's
@@ -38,14 +41,16 @@ def of_end(metrics: dict[str, jax.Array]) -> jax.Array:
 
     Args:
       metrics: `State.metrics` with `reward/CAUSE` () float32, above 0 where the cause ended the
-        episode.
+        episode, for those of the causes that the reward knows.
 
     Returns:
       () int8 hint, `NONE` where nothing of the kind ended.
     """
-    hint = jnp.zeros(metrics[f"reward/{RULES[0][0]}"].shape, jnp.int8)
+    known = {cause: metrics[name] for cause, _ in RULES if (name := f"reward/{cause}") in metrics}
+    hint = jnp.zeros(next(iter(known.values())).shape, jnp.int8)
     for cause, suggested in RULES:
-        hint = jnp.where(metrics[f"reward/{cause}"] > 0, jnp.int8(suggested), hint)
+        if cause in known:
+            hint = jnp.where(known[cause] > 0, jnp.int8(suggested), hint)
     return hint
 
 

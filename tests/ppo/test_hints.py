@@ -17,7 +17,8 @@ from carljax.ppo import hints, trainer
 from carljax.ppo.config import NetworkConfig, PPOConfig
 from carljax.ppo.hints import GO, GO_AND_TURN, NONE, STOP
 from carljax.ppo.networks import ActorCritic
-from carljax.sim.env import METRICS
+from carljax.reward.config import RewardConfig
+from carljax.sim.env import metric_names
 
 CAUSES = [cause for cause, _ in hints.RULES]
 
@@ -31,6 +32,8 @@ CAUSES = [cause for cause, _ in hints.RULES]
         (["red_light"], STOP),
         (["stop_sign"], STOP),
         (["collision"], STOP),
+        (["lateral_distance"], GO_AND_TURN),
+        (["pedestrian_overlap"], STOP),
         (["blocked", "route_deviation"], GO_AND_TURN),
         (["blocked", "route_deviation", "collision"], STOP),
     ],
@@ -42,8 +45,17 @@ def test_what_an_end_suggests(ended_by, expected):
     assert (int(hint), hint.dtype) == (expected, jnp.int8)
 
 
-def test_the_environment_reports_every_cause():
-    assert {f"reward/{cause}" for cause in CAUSES} <= set(METRICS)
+def test_rewards_report_the_causes_that_they_know():
+    carl, roach = (set(metric_names(RewardConfig(name=name))) for name in ("carl", "roach"))
+    asked = {f"reward/{cause}" for cause in CAUSES}
+    assert asked <= carl | roach
+    assert asked - carl == {"reward/lateral_distance", "reward/pedestrian_overlap"}
+    assert asked - roach == {"reward/route_deviation"}
+
+
+def test_causes_that_a_reward_does_not_know_are_left_out():
+    hint = hints.of_end({"reward/collision": jnp.float32(1.0), "reward/progress": jnp.float32(0.0)})
+    assert int(hint) == STOP
 
 
 def _spread(ends, weight):
