@@ -19,8 +19,8 @@ from carljax.sim.route import Route
 from carljax.sim.spawn import END_CLEARANCE
 from carljax.sim.types import Agents, EgoState
 
-# m: CaRL's image reaches 78 m ahead, 50 back and 64 to either side; plus half a bus.
-VIEW_FRONT, VIEW_BACK, VIEW_SIDE = 84.0, 56.0, 70.0
+VIEW_FRONT, VIEW_BACK, VIEW_SIDE = 80.0, 52.0, 66.0  # m, just beyond CaRL's image
+HALF_BUS = 4.0  # m beyond that, so that no part of a long vehicle is seen to appear
 GONE = 150.0  # m from the ego, beyond which an agent is used again
 LEAVING = 100.0  # m from the ego, beyond which one is that drives away from it. source: ours
 SPAWN_GAP = 14.0  # m kept to other cars. source: CARLA's background activity, 15 m
@@ -91,8 +91,8 @@ def respawn(
 def _is_hidden(xy: jax.Array, ego: EgoState) -> jax.Array:
     """(...) bool: places (..., 2) that the ego does not see."""
     seen = geometry.to_frame(xy, ego.xy, ego.yaw)
-    outside = (seen[..., 0] > VIEW_FRONT) | (seen[..., 0] < -VIEW_BACK)
-    return outside | (jnp.abs(seen[..., 1]) > VIEW_SIDE)
+    outside = (seen[..., 0] > VIEW_FRONT + HALF_BUS) | (seen[..., 0] < -VIEW_BACK - HALF_BUS)
+    return outside | (jnp.abs(seen[..., 1]) > VIEW_SIDE + HALF_BUS)
 
 
 def _is_gone(agents: Agents, ego: EgoState, away: jax.Array, road_map: RoadMap) -> jax.Array:
