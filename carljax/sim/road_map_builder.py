@@ -49,10 +49,8 @@ def _lane_arrays(towns: Sequence[Town]) -> dict[str, np.ndarray]:
     rows: dict[str, list[np.ndarray]] = {}
     slots = max(t.junctions.conflict.shape[1] for t in towns)
     forks = max(t.lanes.successors.shape[1] for t in towns)
-    first_block = 0
     for town, first in zip(towns, offsets(towns), strict=True):
         table, cross, light = town.lanes, town.junctions, town.lights
-        block = road_blocks.of_points(town.network, table)
         arrays = {
             "lane_start": table.start + first.point,
             "lane_num_points": table.num_points,
@@ -77,14 +75,13 @@ def _lane_arrays(towns: Sequence[Town]) -> dict[str, np.ndarray]:
             "point_width": table.point_width,
             "point_speed": table.point_speed,
             "point_lane": table.point_lane + first.lane,
-            "point_block": block + first_block,
+            "point_block": road_blocks.of_points(town.network, table),
             "point_left": _shift(town.neighbours.left, first.point),
             "point_right": _shift(town.neighbours.right, first.point),
             "light_cycle": light.cycle,
             "light_start": light.start,
             "light_junction": _shift(light.junction, first.junction),
         }
-        first_block += int(block.max()) + 1
         for name, value in arrays.items():
             rows.setdefault(name, []).append(value)
     return {name: np.concatenate(values) for name, values in rows.items()}
