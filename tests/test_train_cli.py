@@ -197,6 +197,7 @@ def test_the_compile_cache_goes_where_it_is_asked_to(tmp_path, monkeypatch):
     assert asked == [("jax_compilation_cache_dir", str(tmp_path / "here"))]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["roach", "nuplan"])
 def test_other_observations_train_save_and_go_on(kind, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)

@@ -95,7 +95,7 @@ def sheet(raster: np.ndarray, kind: str, env: DrivingEnv) -> Image.Image:
     out = Image.new("RGB", size, (24, 26, 30))
     draw, font = ImageDraw.Draw(out), ImageFont.load_default(size=11)
     vehicle = (float(env.vehicle.length), float(env.vehicle.width))
-    coloured = image.bev_image(raster, config, 2, vehicle, kind)
+    coloured = image.bev_image(raster, env.config.raster, 2, vehicle, kind)
     picture = Image.fromarray(coloured).resize((PICTURE, PICTURE), Image.Resampling.LANCZOS)
     out.paste(picture, (MARGIN, MARGIN))
     for i, name in enumerate(names):

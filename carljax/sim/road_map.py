@@ -53,7 +53,7 @@ class RoadMap(struct.PyTreeNode):
       point_xy: (P, 2) m; point_z: (P,) m; point_yaw: (P,) rad; point_width: (P,) m.
       point_speed: (P,) m/s, comfortable there in view of all bends of the lane from there on.
       point_lane: (P,) int32.
-      point_block: (P,) int32, running index of the road block it lies in (`road_blocks`).
+      point_block: (P,) int32, the road block it lies in, counted within its town (`road_blocks`).
       point_left, point_right: (P,) int32, the point of the lane beside to which traffic may change;
         -1 where there is none, in junctions and across solid lines.
       point_oncoming: (P,) int32, the nearest point of oncoming traffic beside it where a car may

@@ -51,10 +51,8 @@ def _lane_arrays(towns: Sequence[Town]) -> dict[str, np.ndarray]:
     arms = [spawn.arms(t.lanes, t.junctions.junction) for t in towns]
     most_arms = max(a.shape[1] for a in arms)
     forks = max(t.lanes.successors.shape[1] for t in towns)
-    first_block = 0
     for town, first in zip(towns, offsets(towns), strict=True):
         table, cross, light = town.lanes, town.junctions, town.lights
-        block = road_blocks.of_points(town.network, table)
         arrays = {
             "lane_start": table.start + first.point,
             "lane_num_points": table.num_points,
@@ -82,7 +80,7 @@ def _lane_arrays(towns: Sequence[Town]) -> dict[str, np.ndarray]:
             "point_oncoming": _shift(
                 spawn.oncoming(table, town.network.left_hand_traffic), first.point
             ),
-            "point_block": block + first_block,
+            "point_block": road_blocks.of_points(town.network, table),
             "point_left": _shift(town.neighbours.left, first.point),
             "point_right": _shift(town.neighbours.right, first.point),
             "junction_arms": _widen(_shift(arms[first.town], first.lane), most_arms, -1),
@@ -90,7 +88,6 @@ def _lane_arrays(towns: Sequence[Town]) -> dict[str, np.ndarray]:
             "light_start": light.start,
             "light_junction": _shift(light.junction, first.junction),
         }
-        first_block += int(block.max()) + 1
         for name, value in arrays.items():
             rows.setdefault(name, []).append(value)
     out = {name: np.concatenate(values) for name, values in rows.items()}
