@@ -38,7 +38,7 @@ SHORTEST_ARM = 58.0  # m; out of sight aside from the ego's road, with half a ju
 ARM_CLEARANCE = 4.0  # m kept to an arm's beginning. source: ours
 FARTHEST_SINK = 90.0  # m beyond the junction, out of sight. source: ours
 # m from the trigger to the junction. source: ours
-TRIGGER_AHEAD = (20.0, 180.0)
+TRIGGER_AHEAD = (20.0, 110.0)
 # s from when the first car of a stream can be at the meeting to when an ego at the limit is there.
 # source: ours, one or two cars come before it
 LATE = (0.0, 4.0)
