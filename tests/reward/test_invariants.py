@@ -1,4 +1,4 @@
-"""What must hold of every reward under random driving; the benchmark's checks find what is wrong."""
+"""What must hold of every reward under random driving; the benchmark finds what does not."""
 
 import importlib.util
 import sys
