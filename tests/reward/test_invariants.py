@@ -8,11 +8,13 @@ import jax
 import jax.numpy as jnp
 import pytest
 
-from carljax.reward import reward
 from carljax.reward.config import RewardConfig
 
 SCRIPT = Path(__file__).parents[2] / "benchmarks" / "reward_invariants.py"
-NUM_ENVS, NUM_STEPS = 64, 32_000  # the script itself drives a million steps
+# Enough to see most ends. The script itself drives a million steps of every reward, with scenarios:
+# those, and the rewards that share their factors and ends with one of these, only cost compilation.
+NUM_ENVS, NUM_STEPS = 64, 32_000
+REWARDS = ("carl", "carl-nuplan-survival", "roach")
 
 
 @pytest.fixture(scope="module")
@@ -27,16 +29,16 @@ def benchmark():
 
 @pytest.fixture(scope="module")
 def env(benchmark):
-    return benchmark.environment(num_routes=8, seed=0)
+    return benchmark.environment(num_routes=8, seed=0, num_scenario_slots=0)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", reward.REWARDS)
+@pytest.mark.parametrize("name", REWARDS)
 def test_random_driving_breaks_nothing(benchmark, env, name):
     got = benchmark.measure(env, name, NUM_ENVS, NUM_STEPS)
     assert got["steps"] == NUM_STEPS and got["episodes"] >= NUM_ENVS
     assert set(got["broken"].values()) == {0}, got
-    assert sum(count > 0 for count in got["ends"].values()) >= 2
+    assert sum(count > 0 for count in got["ends"].values()) >= 3
     assert got["return"][0] < got["return"][2]
 
 
