@@ -129,17 +129,18 @@ def main() -> int:
     return status
 
 
-def environment(num_routes: int, seed: int) -> DrivingEnv:
+def environment(num_routes: int, seed: int, num_scenario_slots: int = 1) -> DrivingEnv:
     """Short routes among cars, pedestrians and scenarios."""
     config = EnvConfig(
         num_agents=8,
         num_pedestrians=4,
-        num_scenario_slots=1,
+        num_scenario_slots=num_scenario_slots,
         route_length=200.0,
         raster=RasterConfig(16, 16, pixels_per_metre=0.5, ego_from_bottom_px=4),
     )
     there = [town.load(towns.path(name)) for name in ("grid", "village")]
-    bank = episodes.make_bank(there, num_routes, config.population, seed, 200.0, 60.0)
+    spacing = 60.0 if num_scenario_slots else None
+    bank = episodes.make_bank(there, num_routes, config.population, seed, 200.0, spacing)
     return make_env(bank, config, RewardConfig())
 
 
