@@ -181,6 +181,8 @@ def _is_key(leaf: Any) -> bool:
 def _split(train_state: Any) -> tuple[Any, dict[str, Any]]:
     """Parts a training state into parameters and the rest, random keys as their raw words."""
     raw = jax.tree.map(lambda x: jax.random.key_data(x) if _is_key(x) else x, train_state)
+    # Orbax saves no array without elements, and there is nothing in it to save.
+    raw = jax.tree.map(lambda x: x if x.size else None, raw)
     fields = {field.name: getattr(raw, field.name) for field in dataclasses.fields(raw)}
     # What a run doesn't have leaves no trace, so parts that came later don't make it unreadable.
     learner = {name: value for name, value in fields.items() if value is not None}
@@ -188,9 +190,11 @@ def _split(train_state: Any) -> tuple[Any, dict[str, Any]]:
 
 
 def _join(like: Any, params: Any, learner: dict[str, Any]) -> Any:
-    raw = like.replace(**{**learner, "params": params})
-    return jax.tree.map(
-        lambda x, y: jax.random.wrap_key_data(y, impl=jax.random.key_impl(x)) if _is_key(x) else y,
-        like,
-        raw,
-    )
+    def back(x: Any, saved: Any) -> Any:
+        if saved is None:  # an array without elements
+            return x
+        if _is_key(x):
+            return jax.random.wrap_key_data(saved, impl=jax.random.key_impl(x))
+        return saved
+
+    return jax.tree.map(back, like, like.replace(**{**learner, "params": params}))
