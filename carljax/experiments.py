@@ -36,6 +36,7 @@ from carljax import (
 from carljax import config as config_module
 from carljax.ablations import ABLATIONS, Cell
 from carljax.config import HELD_OUT_SEED, Action, ConfigError, TrainConfig
+from carljax.courses import Course
 from carljax.drive import NetworkPolicy
 from carljax.experiment_report import Row
 from carljax.ppo.networks import ActorCritic
@@ -189,8 +190,9 @@ def _train(
                 return False
         del made
         gc.collect()
+    course = courses.carljax_36(config)
     for number in missing:
-        _score(cell, config, seeds.folder(home, number), console)
+        _score(cell, config, course, seeds.folder(home, number), console)
     return True
 
 
@@ -213,9 +215,8 @@ def _score_files(cell: Cell, action: Action, command: Command, folder: Path) -> 
     return [seeds.folder(home, n) / score_file(action) for n in numbers]
 
 
-def _score(cell: Cell, config: TrainConfig, folder: Path, console: Console) -> None:
-    """Drives carljax-36 with a trained run, once for each action that is asked for."""
-    course = courses.carljax_36(config)
+def _score(cell: Cell, config: TrainConfig, course: Course, folder: Path, console: Console) -> None:
+    """Drives a course with a trained run, once for each action that is asked for."""
     network = ActorCritic(config.network)
     first = jax.eval_shape(lambda env: env.reset(jax.random.key(0)), course.env)
     batch = jax.tree.map(lambda x: jax.ShapeDtypeStruct((1, *x.shape), x.dtype), first.obs)

@@ -115,8 +115,8 @@ def _learn(
             since = time.perf_counter()
             state, on_device = train_step(made.env, state)
             values = jax.device_get(on_device)
-            of_all = len(folders) * ppo.batch_size
-            spent = learn.speed(time.perf_counter() - since, of_all, update == start + 1)
+            seconds = time.perf_counter() - since
+            spent = learn.speed(seconds, ppo.batch_size, update == start + 1)
             each = [
                 learn.on_host({name: x[i] for name, x in values.items()}) | spent
                 for i in range(len(folders))
@@ -124,7 +124,8 @@ def _learn(
             for log, metrics in zip(logs, each, strict=True):
                 if update % run.log_every == 0 or update == ppo.num_updates:
                     log.write(update, update * ppo.batch_size, metrics)
-            report.show(update, _mean(each))
+            of_all = learn.speed(seconds, len(folders) * ppo.batch_size, update == start + 1)
+            report.show(update, _mean(each) | of_all)
             last = bool(interrupted) or update == ppo.num_updates
             if last or update % run.checkpoint_every == 0:
                 checkpoint.save(together, state, update, float("nan"), 1)

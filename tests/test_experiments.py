@@ -12,7 +12,17 @@ import numpy as np
 import pytest
 from helpers import once
 
-from carljax import ablations, build, checkpoint, courses, experiments, presets, seeds
+from carljax import (
+    ablations,
+    build,
+    checkpoint,
+    courses,
+    experiments,
+    learn,
+    metrics_log,
+    presets,
+    seeds,
+)
 from carljax.config import RunConfig
 from carljax.ppo import trainer
 from carljax.ppo.config import NetworkConfig, PPOConfig
@@ -21,6 +31,7 @@ from carljax.sim.env import EnvConfig
 from carljax.sim.raster_canvas import RasterConfig
 
 NUM_UPDATES = 2
+SPEED = "time/env_steps_per_s"
 TINY = dataclasses.replace(
     presets.CPU,
     env=EnvConfig(
@@ -70,6 +81,8 @@ def experiment(tmp_path_factory):
         patch.setattr(courses, "carljax_36", two_routes)
         patch.setitem(presets.PRESETS, "tiny", presets.Preset("small", TINY))
         patch.setenv("COLUMNS", "200")
+        # As if every update took a second.
+        patch.setattr(learn, "speed", lambda _, samples, __: {SPEED: float(samples)})
         straight, cut = folder / "straight", folder / "cut"
         assert experiments.main([*ARGS, "--dir", str(straight)]) == 0
         assert len(calls) == 4
@@ -78,7 +91,7 @@ def experiment(tmp_path_factory):
         kept = {path: path.stat().st_mtime_ns for path in (cut / "4-epochs").rglob("*")}
         num_scored = len(scored)
         assert experiments.main([*ARGS, "--dir", str(cut)]) == 0
-        assert len(calls) == 8 and len(scored) == num_scored + 2
+        assert len(calls) == 8 and len(scored) == num_scored + 1
         assert {path: path.stat().st_mtime_ns for path in (cut / "4-epochs").rglob("*")} == kept
         assert set(calls) == {2}  # seeds side by side
         assert experiments.main([*ARGS, "--dir", str(cut)]) == 0
@@ -97,6 +110,13 @@ def test_the_table_has_a_row_for_each_cell(experiment):
         assert row["RC"]["mean"] == pytest.approx(np.mean(each))
         assert row["RC"]["std"] == pytest.approx(np.std(each, ddof=1))
         assert shown[4].strip() == f"{np.mean(each):.1f} ± {np.std(each, ddof=1):.1f}"
+
+
+def test_a_run_logs_its_own_samples_and_not_those_of_all(experiment):
+    for seed in (0, 1):
+        lines = metrics_log.read(experiment[0] / "3-epochs" / f"seed-{seed}")
+        assert [line["env_steps"] for line in lines] == [16, 32]
+        assert [line[SPEED] for line in lines] == [16.0, 16.0]
 
 
 def test_there_is_a_plot(experiment):
