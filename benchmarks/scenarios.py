@@ -118,6 +118,9 @@ def main() -> int:
         return 2
     for kind in command.kind:
         journeys = draw(towns, kind, command.num, command.seed)
+        if not journeys:
+            print(f"error: {kind}: no place suits it in {', '.join(names)}", file=sys.stderr)
+            return 2
         for driver in command.driver:
             line = measure(towns, journeys, kind, driver, command)
             print(json.dumps({**line, "machine": machine.describe()}), flush=True)
