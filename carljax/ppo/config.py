@@ -81,10 +81,11 @@ class PPOConfig:
     clip_vloss: float | None = 0.1
     """Range of the value around the one at collection, in units of return; None: not clipped."""
     norm_adv: bool = True
-    """Normalise advantages over each minibatch."""
-    norm_adv_scope: Literal["all", "device"] = "all"
-    """Over the minibatch of all devices together, or each device over its own part of it, as the
-    authors' code does for nuPlan; the same on one device."""
+    """Normalise advantages to mean 0 and deviation 1."""
+    norm_adv_scope: Literal["all", "device", "late"] = "all"
+    """Over each minibatch of all devices together; or each device over its own part of it, as the
+    authors' code does for nuPlan; or over the whole batch from the second epoch on, while the first
+    sees them as they are, as in Roach's code."""
     ent_coef: float = 0.01
     """Weight of the entropy bonus."""
     entropy_reduction: Literal["sum", "mean"] = "sum"

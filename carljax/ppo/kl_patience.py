@@ -16,7 +16,7 @@ from flax import struct
 
 KL = "kl"  # the metric that decides
 
-Epoch = Callable[[Any, jax.Array], tuple[Any, dict[str, jax.Array]]]
+Epoch = Callable[[Any, Any], tuple[Any, dict[str, jax.Array]]]
 
 
 class KLPatience(struct.PyTreeNode):
@@ -56,32 +56,36 @@ def advance(memory: KLPatience, exceeded: jax.Array, patience: int) -> KLPatienc
 
 
 def run_epochs(
-    epoch: Epoch, learner: Any, keys: jax.Array, target_kl: float
+    epoch: Epoch, learner: Any, epochs: Any, target_kl: float
 ) -> tuple[Any, dict[str, jax.Array]]:
     """Runs epochs until one is above the target; that one is made to its end.
 
     Args:
-      epoch: epoch(learner, key) -> (learner, {name: (steps,)}), `KL` among the names.
+      epoch: epoch(learner, x) -> (learner, {name: (steps,)}), `KL` among the names.
       learner: parameters and optimiser state.
-      keys: (E,) PRNG keys, one for each epoch at most.
+      epochs: a pytree with an axis (E,) in front, E epochs at most: x of each of them.
       target_kl: the target.
 
     Returns:
       The learner, and {name: ()} means over all gradient steps made; `KL` is the mean over the last
       epoch, and "epochs" their number.
     """
+    most = jax.tree.leaves(epochs)[0].shape[0]
+
+    def pick(number: int | jax.Array) -> Any:
+        return jax.tree.map(lambda x: x[number], epochs)
 
     def goes_on(carry: tuple) -> jax.Array:
         number, _, _, kl = carry
-        return (number < keys.shape[0]) & ~(kl > target_kl)
+        return (number < most) & ~(kl > target_kl)
 
     def another(carry: tuple) -> tuple:
         number, learner, sums, _ = carry
-        learner, metrics = epoch(learner, keys[number])
+        learner, metrics = epoch(learner, pick(number))
         means = jax.tree.map(jnp.mean, metrics)
         return number + 1, learner, jax.tree.map(jnp.add, sums, means), means[KL]
 
-    names = jax.eval_shape(epoch, learner, keys[0])[1]
+    names = jax.eval_shape(epoch, learner, pick(0))[1]
     sums = {name: jnp.zeros((), jnp.float32) for name in names}
     first = (jnp.zeros((), jnp.int32), learner, sums, jnp.full((), -jnp.inf, jnp.float32))
     number, learner, sums, kl = jax.lax.while_loop(goes_on, another, first)

@@ -9,6 +9,7 @@ summed already, once per micro-batch, and the `psum` would count them again.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -86,8 +87,11 @@ def update(
     """
     optimizer = make_optimizer(config)
     num_samples = samples.weight.shape[0]
+    later = later_advantage(samples, config)
 
-    def gradient_step(carry: tuple, rows: jax.Array) -> tuple[tuple, dict[str, jax.Array]]:
+    def gradient_step(
+        samples: Minibatch, carry: tuple, rows: jax.Array
+    ) -> tuple[tuple, dict[str, jax.Array]]:
         params, opt_state = carry
         grads, metrics = minibatch_gradient(params, samples, rows, network, config)
         squares = [jnp.sum(jnp.square(grad)) for grad in jax.tree.leaves(grads)]
@@ -96,17 +100,31 @@ def update(
         params = jax.tree.map(lambda p, d: p - rate * d, params, direction)
         return (params, opt_state), metrics
 
-    def epoch(carry: tuple, key: jax.Array) -> tuple[tuple, dict[str, jax.Array]]:
+    def epoch(
+        carry: tuple, number_and_key: tuple[jax.Array, jax.Array]
+    ) -> tuple[tuple, dict[str, jax.Array]]:
+        number, key = number_and_key
+        seen = samples.replace(advantage=jnp.where(number == 0, samples.advantage, later))
         rows = jax.random.permutation(key, num_samples).reshape(config.num_minibatches, -1)
-        return jax.lax.scan(gradient_step, carry, rows)
+        return jax.lax.scan(functools.partial(gradient_step, seen), carry, rows)
 
-    keys = jax.random.split(key, config.update_epochs)
+    epochs = (
+        jnp.arange(config.update_epochs),
+        jax.random.split(key, config.update_epochs),
+    )
     learner = (params, opt_state)
     if config.kl_patience is not None:
-        learner, metrics = kl_patience.run_epochs(epoch, learner, keys, config.target_kl)
+        learner, metrics = kl_patience.run_epochs(epoch, learner, epochs, config.target_kl)
         return *learner, metrics
-    learner, metrics = jax.lax.scan(epoch, learner, keys)
+    learner, metrics = jax.lax.scan(epoch, learner, epochs)
     return *learner, jax.tree.map(jnp.mean, metrics)
+
+
+def later_advantage(samples: Minibatch, config: PPOConfig) -> jax.Array:
+    """Returns (N,) the advantages of all epochs but the first; see `PPOConfig.norm_adv_scope`."""
+    if config.norm_adv and config.norm_adv_scope == "late":
+        return normalise(samples.advantage, samples.weight)
+    return samples.advantage
 
 
 def minibatch_gradient(
@@ -126,7 +144,7 @@ def minibatch_gradient(
     """
     weight = samples.weight[rows]
     advantage = samples.advantage[rows]
-    if config.norm_adv:
+    if config.norm_adv and config.norm_adv_scope != "late":
         over = sum_over_devices if config.norm_adv_scope == "all" else no_sum
         advantage = normalise(advantage, weight, over)
     weight = weight / jnp.maximum(jax.lax.psum(jnp.sum(weight), AXIS), 1.0)

@@ -49,6 +49,12 @@ def _samples(num=NUM, size=16):
     )
 
 
+def _samples_with_policy():
+    samples = _samples()
+    alpha, beta, _ = NETWORK.apply(_params(), samples.obs)
+    return samples.replace(policy=(alpha, beta))
+
+
 @functools.cache
 def _params(network=NETWORK, size=16):
     obs = jax.tree.map(lambda x: x[:1], _samples(4, size).obs)
@@ -134,6 +140,37 @@ def test_the_scope_of_normalisation_reaches_the_gradient():
 
 
 @pytest.mark.parametrize("num_devices", [1, 4])
+def test_late_advantages_are_those_of_the_whole_batch(num_devices):
+    samples = _samples()
+    config = PPOConfig(norm_adv_scope="late")
+    spec = PartitionSpec(update.AXIS)
+    later = _on_devices(lambda s: update.later_advantage(s, config), num_devices, out_specs=spec)
+    advantage = np.float64(samples.advantage)
+    valid = advantage[np.asarray(samples.weight) > 0]
+    expected = (advantage - valid.mean()) / valid.std(ddof=1)
+    np.testing.assert_allclose(later(samples), expected, atol=1e-5)
+
+
+@pytest.mark.parametrize("kl_patience", [None, 8])
+def test_late_normalisation_leaves_the_first_epoch_alone(kl_patience):
+    """At a rate of 0 every epoch has the same gradient, but for its advantages."""
+
+    def policy_loss(epochs, **changes):
+        config = PPOConfig(
+            update_epochs=epochs, num_minibatches=1, kl_patience=kl_patience, target_kl=1e9
+        )
+        config = dataclasses.replace(config, **changes)
+        return float(_update(config, rate=0.0)(_samples_with_policy())[2]["policy_loss"])
+
+    raw, late = policy_loss(1, norm_adv=False), policy_loss(1)
+    assert abs(raw - late) > 1e-2
+    late_only = dict(norm_adv_scope="late")
+    np.testing.assert_allclose(policy_loss(1, **late_only), raw, rtol=1e-5)
+    np.testing.assert_allclose(policy_loss(3, **late_only), (raw + 2 * late) / 3, rtol=1e-5)
+    np.testing.assert_allclose(policy_loss(3, norm_adv=False, **late_only), raw, rtol=1e-5)
+
+
+@pytest.mark.parametrize("num_devices", [1, 4])
 def test_explained_variance(num_devices):
     samples = _samples()
     samples = samples.replace(value=0.7 * samples.target + 0.2 * samples.value)
@@ -156,13 +193,13 @@ def test_a_batch_of_restarts_changes_nothing_but_stays_finite():
         np.testing.assert_array_equal(grad, 0.0)
 
 
-def _update(config, network=NETWORK, size=16):
+def _update(config, network=NETWORK, size=16, rate=0.01):
     params = _params(network, size)
     opt_state = update.make_optimizer(config).init(params)
 
     def run(samples):
         return update.update(
-            params, opt_state, samples, jax.random.key(3), jnp.float32(0.01), network, config
+            params, opt_state, samples, jax.random.key(3), jnp.float32(rate), network, config
         )
 
     return _on_devices(run, 1)
