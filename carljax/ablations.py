@@ -1,4 +1,4 @@
-"""The tables of the paper's method as data: what is trained in each cell, and how it is scored.
+"""The tables of the paper's method, and one of ours, as data: what a cell trains, how it is scored.
 
 A cell is a preset with a few values changed; the preset is the user's, so that the same table can
 be made on a laptop and on a node of GPUs. Where the paper gives a size (a minibatch of 256) that is
@@ -50,10 +50,12 @@ class Ablation:
     Attributes:
       title: what it asks, and where it stands in the paper.
       cells: in the paper's order.
+      preset: the one that it is about; None for the user's.
     """
 
     title: str
     cells: tuple[Cell, ...]
+    preset: str | None = None
 
 
 def _input(kind: str, encoder: str) -> dict[str, Any]:
@@ -128,6 +130,29 @@ ABLATIONS: dict[str, Ablation] = {
             Cell("Roach, 192 x 192 x 15", _input("roach", "roach")),
             Cell("CaRL, 256 x 256 x 10", _input("carla", "carl")),
         ),
+    ),
+    # Ours: what the values of the preset `cpu` rest on. With --minutes each cell has the same time.
+    "cpu-preset": Ablation(
+        "The cpu preset with one thing changed",
+        (
+            Cell("as it is"),
+            Cell("no value at truncation", {"ppo.bootstrap_truncated": False}),
+            Cell("64 x 64 px", {"env.raster.width": 64}),
+            Cell(
+                "96 x 60 px, 1.5 px/m",
+                {
+                    "env.raster.height": 96,
+                    "env.raster.width": 60,
+                    "env.raster.pixels_per_metre": 1.5,
+                    "env.raster.ego_from_bottom_px": 24,
+                },
+            ),
+            Cell("convolutions", {"network.encoder": "carl"}),
+            Cell("256 environments", {"ppo.num_envs": 256}),
+            Cell("batch of 128 steps", {"ppo.num_steps": 128}),
+            Cell("2 epochs", {"ppo.update_epochs": 2}),
+        ),
+        preset="cpu",
     ),
 }
 

@@ -29,11 +29,13 @@ class Row:
     Attributes:
       name: of the cell.
       action: statistic of the policy that drove.
+      num_samples: of each training.
       files: scores, one for each seed, each in its run's directory.
     """
 
     name: str
     action: str
+    num_samples: int
     files: tuple[Path, ...]
 
     @property
@@ -74,11 +76,11 @@ def write(rows: Sequence[Row], title: str, folder: Path) -> None:
       folder: where.
     """
     found = table(rows)
-    heads = ("", "seeds", *COLUMNS)
+    heads = ("", "seeds", "samples", *COLUMNS)
     lines = [f"# {title}", "", _line(heads), _line(["---"] * len(heads))]
     for row, (label, spread) in zip(rows, found, strict=True):
         cells = [_text(name, *spread[name]) for name in COLUMNS]
-        lines.append(_line([label, str(len(row.files)), *cells]))
+        lines.append(_line([label, str(len(row.files)), f"{row.num_samples:,}", *cells]))
     lines += ["", "Mean ± sample standard deviation over seeds, on carljax-36. DS, RC, clean: %;"]
     lines += ["the others per km."]
     atomic.write_text(folder / TABLE_FILE, "\n".join(lines) + "\n")
@@ -86,6 +88,7 @@ def write(rows: Sequence[Row], title: str, folder: Path) -> None:
         {
             "row": label,
             "action": row.action,
+            "num_samples": row.num_samples,
             "runs": [str(path.parent.relative_to(folder)) for path in row.files],
             **{name: {"mean": mean, "std": std} for name, (mean, std) in spread.items()},
             "each": [values(path) for path in row.files],
@@ -101,10 +104,13 @@ def show(rows: Sequence[Row], title: str, console: Console) -> None:
     """Prints the table."""
     shown = Table(title=title, title_justify="left", box=box.SIMPLE, padding=(0, 1, 0, 0))
     shown.add_column("")
+    shown.add_column("samples", justify="right", no_wrap=True)
     for name in COLUMNS:
         shown.add_column(name, justify="right", no_wrap=True)
-    for label, spread in table(rows):
-        shown.add_row(label, *(_text(name, *spread[name]) for name in COLUMNS))
+    for row, (label, spread) in zip(rows, table(rows), strict=True):
+        shown.add_row(
+            label, f"{row.num_samples:,}", *(_text(name, *spread[name]) for name in COLUMNS)
+        )
     console.print(shown, highlight=False)
 
 

@@ -11,12 +11,13 @@ from __future__ import annotations
 import dataclasses
 import gc
 import json
+import math
 import re
 import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import jax
 import tyro
@@ -32,6 +33,7 @@ from carljax import (
     experiment_report,
     presets,
     seeds,
+    time_budget,
 )
 from carljax import config as config_module
 from carljax.ablations import ABLATIONS, Cell
@@ -60,6 +62,7 @@ class Command:
             "architecture",
             "action-distribution",
             "input",
+            "cpu-preset",
         ]
     ]
     """The table."""
@@ -69,6 +72,9 @@ class Command:
     """Seed of the first of them; the others follow. It is the seed of everybody's routes too."""
     samples: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
     """Environment steps of a training; the preset's own by default."""
+    minutes: Annotated[float | None, tyro.conf.arg(metavar="MIN")] = None
+    """Instead of samples: as many as this machine makes in so much time, measured for each cell
+    before anything is trained, so do nothing else on it meanwhile."""
     preset: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
     """Preset that the cells are changes of; this machine's default."""
     dir: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
@@ -106,21 +112,38 @@ def run(command: Command, console: Console) -> int:
     Returns:
       Exit status.
     """
-    base, samples = _check(command)
+    base = _check(command)
     ablation = ABLATIONS[command.name]
     folder = command.dir or Path("experiments") / command.name
-    plan = [(cell, ablations.configure(cell, base, samples)) for cell in ablation.cells]
-    for _, config in plan:
+    for cell in ablation.cells:
+        config = ablations.configure(cell, base, 1)
         config.validate(config.run.num_devices or jax.device_count())
-    _open(folder, command, samples, plan)
+    path = folder / PLAN_FILE
+    begun = _read(path)
+    asked: dict[str, Any] = {"name": command.name, "first_seed": command.first_seed}
+    asked["minutes"] = command.minutes
+    _check_same(path, begun, asked)
+    known = begun.get("samples", {}) if command.minutes is not None else {}
+    samples = _samples(ablation.cells, base, command, known, console)
+    plan = [(cell, ablations.configure(cell, base, samples[cell.name])) for cell in ablation.cells]
+    asked["samples"] = samples
+    asked["cells"] = {cell.name: config_module.to_json(config) for cell, config in plan}
+    _check_same(path, begun, asked)
+    if not begun:
+        atomic.write_text(path, json.dumps(asked, indent=2) + "\n")
     console.print(f"{ablation.title}: {len(plan)} cells, {command.seeds} seeds, {folder}")
     for cell, config in plan:
         if not _train(cell, config, command, folder, console):
             console.print("stopped; the same command goes on from here")
             return 0
     rows = [
-        Row(cell.name, action, tuple(_score_files(cell, action, command, folder)))
-        for cell in ablation.cells
+        Row(
+            cell.name,
+            action,
+            config.ppo.total_samples,
+            tuple(_score_files(cell, action, command, folder)),
+        )
+        for cell, config in plan
         for action in cell.actions
     ]
     experiment_report.write(rows, ablation.title, folder)
@@ -129,14 +152,21 @@ def run(command: Command, console: Console) -> int:
     return 0
 
 
-def _check(command: Command) -> tuple[TrainConfig, int]:
-    """The preset and the number of samples, after checking what was given."""
+def _check(command: Command) -> TrainConfig:
+    """The preset, after checking what was given."""
     for name in ("seeds", "samples", "seeds_at_once"):
         value = getattr(command, name)
         if value is not None and value < 1:
             flag = name.replace("_", "-")
             raise ConfigError(f"--{flag} {value}: is below the least allowed, 1")
-    name = command.preset or presets.default_name()
+    if command.minutes is not None and not 0.0 < command.minutes < math.inf:
+        raise ConfigError(f"--minutes {command.minutes}: is not a number above 0")
+    if command.minutes is not None and command.samples is not None:
+        raise ConfigError("--minutes and --samples exclude each other; give one of them")
+    own = ABLATIONS[command.name].preset
+    name = command.preset or own or presets.default_name()
+    if own is not None and name != own:
+        raise ConfigError(f"--preset {name}: {command.name} is about the preset {own}")
     if name not in presets.PRESETS:
         raise ConfigError(f"--preset {name}: is none of {', '.join(presets.PRESETS)}")
     last = command.first_seed + command.seeds - 1
@@ -144,30 +174,50 @@ def _check(command: Command) -> tuple[TrainConfig, int]:
         raise ConfigError(f"--first-seed {command.first_seed}: is not from 0 to {HELD_OUT_SEED}")
     base = presets.PRESETS[name].config
     shared = dataclasses.replace(base.run, routes_seed=command.first_seed)
-    return dataclasses.replace(base, run=shared), command.samples or base.ppo.total_samples
+    return dataclasses.replace(base, run=shared)
 
 
-def _open(folder: Path, command: Command, samples: int, plan: Plan) -> None:
-    """Notes what is run in a folder, or checks that it is what was begun there."""
-    wanted = {
-        "name": command.name,
-        "samples": samples,
-        "first_seed": command.first_seed,
-        "cells": {cell.name: config_module.to_json(config) for cell, config in plan},
-    }
-    path = folder / PLAN_FILE
+def _read(path: Path) -> dict[str, Any]:
+    """What a folder notes of its experiment; nothing if none was begun there."""
     if not path.exists():
-        atomic.write_text(path, json.dumps(wanted, indent=2) + "\n")
-        return
+        return {}
     try:
         begun = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
         raise ConfigError(f"{path}: can't be read: {error}") from error
-    for name, value in json.loads(json.dumps(wanted)).items():
-        if begun.get(name) != value:
+    if not isinstance(begun, dict):
+        raise ConfigError(f"{path}: is no experiment's plan")
+    return begun
+
+
+def _check_same(path: Path, begun: dict[str, Any], asked: dict[str, Any]) -> None:
+    """Checks that what was begun, if anything was, is what is asked for."""
+    for name, value in json.loads(json.dumps(asked)).items():
+        if begun and begun.get(name) != value:
             raise ConfigError(
                 f"{path}: was begun with other values of {name}; give those, or another --dir"
             )
+
+
+def _samples(
+    cells: Sequence[Cell],
+    base: TrainConfig,
+    command: Command,
+    known: dict[str, int],
+    console: Console,
+) -> dict[str, int]:
+    """Samples that each cell is to be trained with; measured if minutes are given, once."""
+    if command.minutes is None:
+        return {cell.name: command.samples or base.ppo.total_samples for cell in cells}
+    samples = {}
+    for cell in cells:
+        if cell.name not in known:
+            rate = time_budget.samples_per_second(ablations.configure(cell, base, 1))
+            known = known | {cell.name: max(round(60.0 * command.minutes * rate), 1)}
+            console.print(f"{cell.name}: {rate:,.0f} samples/s")
+            gc.collect()
+        samples[cell.name] = known[cell.name]
+    return samples
 
 
 def _train(

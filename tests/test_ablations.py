@@ -19,7 +19,7 @@ def configs(name, base=CPU, samples=10_000_000):
 @pytest.mark.parametrize("preset", ["cpu", "carl-carla", "atari"])
 @pytest.mark.parametrize("name", ABLATIONS)
 def test_every_cell_can_be_trained(name, preset):
-    base = presets.PRESETS[preset].config
+    base = presets.PRESETS[ABLATIONS[name].preset or preset].config
     made = configs(name, base)
     for config in made:
         config.validate(1)

@@ -6,8 +6,10 @@ import dataclasses
 import json
 import os
 import signal
+import types
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import once
@@ -22,6 +24,7 @@ from carljax import (
     metrics_log,
     presets,
     seeds,
+    time_budget,
 )
 from carljax.config import RunConfig
 from carljax.ppo import trainer
@@ -105,11 +108,12 @@ def test_the_table_has_a_row_for_each_cell(experiment):
     assert [row[1].strip() for row in rows[2:]] == ["4 epochs", "3 epochs"]
     numbers = json.loads((experiment[0] / "results.json").read_text())["rows"]
     for row, shown in zip(numbers, rows[2:], strict=True):
+        assert row["num_samples"] == NUM_UPDATES * 16 and shown[3].strip() == "32"
         each = [run["RC"] for run in row["each"]]
         assert len(each) == 2
         assert row["RC"]["mean"] == pytest.approx(np.mean(each))
         assert row["RC"]["std"] == pytest.approx(np.std(each, ddof=1))
-        assert shown[4].strip() == f"{np.mean(each):.1f} ± {np.std(each, ddof=1):.1f}"
+        assert shown[5].strip() == f"{np.mean(each):.1f} ± {np.std(each, ddof=1):.1f}"
 
 
 def test_a_run_logs_its_own_samples_and_not_those_of_all(experiment):
@@ -162,12 +166,17 @@ def test_other_values_in_the_same_folder_are_refused(experiment, capsys):
     [
         (["--seeds", "0"], "--seeds 0: is below the least allowed, 1"),
         (["--samples", "0"], "--samples 0: is below"),
+        (["--minutes", "0"], "--minutes 0.0: is not a number above 0"),
+        (["--minutes", "nan"], "--minutes nan: is not a number above 0"),
+        (["--minutes", "1", "--samples", "5"], "--minutes and --samples exclude each other"),
         (["--preset", "cpuu"], "--preset cpuu: is none of cpu, "),
         (["--first-seed", "-1"], "--first-seed -1: is not from 0"),
+        (["cpu-preset", "--preset", "atari"], "--preset atari: cpu-preset is about the preset cpu"),
     ],
 )
 def test_mistakes_are_said_in_one_line(args, reason, capsys, tmp_path):
-    assert experiments.main(["epochs", *args, "--dir", str(tmp_path / "out")]) == 2
+    name = [] if args[0] == "cpu-preset" else ["epochs"]
+    assert experiments.main([*name, *args, "--dir", str(tmp_path / "out")]) == 2
     error = capsys.readouterr().err
     assert error.startswith("error: ") and reason in error and error.count("\n") == 1
     assert not (tmp_path / "out").exists()
@@ -178,3 +187,44 @@ def test_groups_go_on_with_whom_they_began(tmp_path):
     (tmp_path / f"{seeds.TOGETHER}1-2").mkdir()
     assert seeds.groups([2, 3], 4, tmp_path) == [(1, 2), (3,)]
     assert seeds.groups([3, 4], 4, tmp_path) == [(3, 4)]
+
+
+def test_minutes_are_turned_into_samples_once(tmp_path, monkeypatch, capsys):
+    """Each cell at its own speed; what was measured is kept for when the command goes on."""
+    measured, trained = [], []
+
+    def speed(config):
+        measured.append(config.ppo.update_epochs)
+        return {4: 10.0, 3: 20.0}[config.ppo.update_epochs]
+
+    def interrupted(cell, config, *_):
+        trained.append((cell.name, config.ppo.total_samples))
+        return cell.name == "4 epochs"
+
+    monkeypatch.setitem(presets.PRESETS, "tiny", presets.Preset("small", TINY))
+    monkeypatch.setattr(time_budget, "samples_per_second", speed)
+    monkeypatch.setattr(experiments, "_train", interrupted)
+    args = ["epochs", "--preset", "tiny", "--dir", str(tmp_path), "--minutes"]
+    for _ in range(2):
+        assert experiments.main([*args, "0.5"]) == 0
+    assert measured == [4, 3]
+    assert trained == 2 * [("4 epochs", 300), ("3 epochs", 600)]
+    assert experiments.main([*args, "1.5"]) == 2
+    assert "was begun with other values of minutes" in capsys.readouterr().err
+    assert measured == [4, 3]
+
+
+def test_the_speed_is_that_of_the_median_update(monkeypatch):
+    """The first, which compiles, and the second do not count."""
+    updates = [50.0, 9.0, 1.0, 2.0, 7.0, 4.0, 6.0, 5.0, 3.0]
+    ends = np.cumsum(updates)
+    readings = iter(np.stack([ends - updates, ends], axis=1).ravel())
+    clock = types.SimpleNamespace(perf_counter=lambda: float(next(readings)))
+    made = types.SimpleNamespace(network=None, mesh=None, env=None)
+    monkeypatch.setattr(time_budget, "time", clock)
+    monkeypatch.setattr(build, "setup", lambda config: made)
+    monkeypatch.setattr(build, "initial_state", lambda made: jnp.zeros(()))
+    step = lambda env, state: (state + 1, {})  # noqa: E731
+    monkeypatch.setattr(trainer, "make_train_step", lambda *_: step)
+    assert time_budget.samples_per_second(TINY) == TINY.ppo.batch_size / 4.0
+    assert next(readings, None) is None
