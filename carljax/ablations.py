@@ -131,7 +131,7 @@ ABLATIONS: dict[str, Ablation] = {
             Cell("CaRL, 256 x 256 x 10", _input("carla", "carl")),
         ),
     ),
-    # Ours: what the values of the preset `cpu` rest on. With --minutes each cell has the same time.
+    # Ours: to judge the values of the preset `cpu` by. With --minutes each cell has the same time.
     "cpu-preset": Ablation(
         "The cpu preset with one thing changed",
         (

@@ -118,19 +118,7 @@ def run(command: Command, console: Console) -> int:
     for cell in ablation.cells:
         config = ablations.configure(cell, base, 1)
         config.validate(config.run.num_devices or jax.device_count())
-    path = folder / PLAN_FILE
-    begun = _read(path)
-    asked: dict[str, Any] = {"name": command.name, "first_seed": command.first_seed}
-    asked["minutes"] = command.minutes
-    _check_same(path, begun, asked)
-    known = begun.get("samples", {}) if command.minutes is not None else {}
-    samples = _samples(ablation.cells, base, command, known, console)
-    plan = [(cell, ablations.configure(cell, base, samples[cell.name])) for cell in ablation.cells]
-    asked["samples"] = samples
-    asked["cells"] = {cell.name: config_module.to_json(config) for cell, config in plan}
-    _check_same(path, begun, asked)
-    if not begun:
-        atomic.write_text(path, json.dumps(asked, indent=2) + "\n")
+    plan = _plan(ablation.cells, base, command, folder / PLAN_FILE, console)
     console.print(f"{ablation.title}: {len(plan)} cells, {command.seeds} seeds, {folder}")
     for cell, config in plan:
         if not _train(cell, config, command, folder, console):
@@ -177,6 +165,30 @@ def _check(command: Command) -> TrainConfig:
     return dataclasses.replace(base, run=shared)
 
 
+def _plan(
+    cells: Sequence[Cell], base: TrainConfig, command: Command, path: Path, console: Console
+) -> Plan:
+    """Each cell with its configuration: as begun in the folder, or newly made and noted there."""
+    begun = _read(path)
+    asked: dict[str, Any] = {
+        "name": command.name,
+        "first_seed": command.first_seed,
+        "minutes": command.minutes,
+    }
+    _check_same(path, begun, asked)
+    if begun and command.minutes is not None:
+        samples = _measured_before(path, begun, cells)
+    else:
+        samples = _samples(cells, base, command, console)
+    plan = [(cell, ablations.configure(cell, base, samples[cell.name])) for cell in cells]
+    asked["samples"] = samples
+    asked["cells"] = {cell.name: config_module.to_json(config) for cell, config in plan}
+    _check_same(path, begun, asked)
+    if not begun:
+        atomic.write_text(path, json.dumps(asked, indent=2) + "\n")
+    return plan
+
+
 def _read(path: Path) -> dict[str, Any]:
     """What a folder notes of its experiment; nothing if none was begun there."""
     if not path.exists():
@@ -199,24 +211,28 @@ def _check_same(path: Path, begun: dict[str, Any], asked: dict[str, Any]) -> Non
             )
 
 
+def _measured_before(path: Path, begun: dict[str, Any], cells: Sequence[Cell]) -> dict[str, int]:
+    """Samples of each cell from the folder's note."""
+    samples = begun.get("samples")
+    for cell in cells:
+        number = samples.get(cell.name) if isinstance(samples, dict) else None
+        if type(number) is not int or number < 1:
+            raise ConfigError(f"{path}: samples: has no whole number above 0 for {cell.name!r}")
+    return {cell.name: begun["samples"][cell.name] for cell in cells}
+
+
 def _samples(
-    cells: Sequence[Cell],
-    base: TrainConfig,
-    command: Command,
-    known: dict[str, int],
-    console: Console,
+    cells: Sequence[Cell], base: TrainConfig, command: Command, console: Console
 ) -> dict[str, int]:
-    """Samples that each cell is to be trained with; measured if minutes are given, once."""
+    """Samples that each cell is to be trained with; measured if minutes are given."""
     if command.minutes is None:
         return {cell.name: command.samples or base.ppo.total_samples for cell in cells}
     samples = {}
     for cell in cells:
-        if cell.name not in known:
-            rate = time_budget.samples_per_second(ablations.configure(cell, base, 1))
-            known = known | {cell.name: max(round(60.0 * command.minutes * rate), 1)}
-            console.print(f"{cell.name}: {rate:,.0f} samples/s")
-            gc.collect()
-        samples[cell.name] = known[cell.name]
+        rate = time_budget.samples_per_second(ablations.configure(cell, base, 1))
+        samples[cell.name] = max(round(60.0 * command.minutes * rate), 1)
+        console.print(f"{cell.name}: {rate:,.0f} samples/s")
+        gc.collect()
     return samples
 
 

@@ -228,3 +228,24 @@ def test_the_speed_is_that_of_the_median_update(monkeypatch):
     monkeypatch.setattr(trainer, "make_train_step", lambda *_: step)
     assert time_budget.samples_per_second(TINY) == TINY.ppo.batch_size / 4.0
     assert next(readings, None) is None
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        ("{", "can't be read: "),
+        ("[]", "is no experiment's plan"),
+        ('{"name": "epochs", "first_seed": 0, "minutes": 1.0, "samples": 5}', "'4 epochs'"),
+        (
+            '{"name": "epochs", "first_seed": 0, "minutes": 1.0, '
+            '"samples": {"4 epochs": 9, "3 epochs": "9"}}',
+            "samples: has no whole number above 0 for '3 epochs'",
+        ),
+    ],
+)
+def test_a_damaged_plan_is_said_in_one_line(text, reason, tmp_path, capsys):
+    (tmp_path / "experiment.json").write_text(text)
+    assert experiments.main(["epochs", "--minutes", "1", "--dir", str(tmp_path)]) == 2
+    error = capsys.readouterr().err
+    assert "experiment.json: " in error and reason in error and error.count("\n") == 1
+    assert (tmp_path / "experiment.json").read_text() == text
