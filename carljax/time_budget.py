@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import statistics
-import time
+from typing import Any
 
-import jax
-
-from carljax import build
+from carljax import build, timing
 from carljax.config import TrainConfig
 from carljax.ppo import trainer
 
@@ -27,12 +25,11 @@ def samples_per_second(config: TrainConfig) -> float:
       As `build.setup`.
     """
     made = build.setup(config)
-    state = build.initial_state(made)
+    first = build.initial_state(made)
     train_step = trainer.make_train_step(made.network, config.ppo, made.mesh)
-    seconds = []
-    for _ in range(REPEATS + 2):
-        since = time.perf_counter()
-        state, metrics = train_step(made.env, state)
-        jax.block_until_ready((state, metrics))
-        seconds.append(time.perf_counter() - since)
-    return config.ppo.batch_size / statistics.median(seconds[2:])
+
+    def follow(result: Any) -> tuple:
+        return made.env, first if result is None else result[0]
+
+    seconds = timing.call_seconds(train_step, follow, REPEATS, warm_up=2)
+    return config.ppo.batch_size / statistics.median(seconds)

@@ -25,6 +25,7 @@ from carljax import (
     presets,
     seeds,
     time_budget,
+    timing,
 )
 from carljax.config import RunConfig
 from carljax.ppo import trainer
@@ -221,7 +222,7 @@ def test_the_speed_is_that_of_the_median_update(monkeypatch):
     readings = iter(np.stack([ends - updates, ends], axis=1).ravel())
     clock = types.SimpleNamespace(perf_counter=lambda: float(next(readings)))
     made = types.SimpleNamespace(network=None, mesh=None, env=None)
-    monkeypatch.setattr(time_budget, "time", clock)
+    monkeypatch.setattr(timing, "time", clock)
     monkeypatch.setattr(build, "setup", lambda config: made)
     monkeypatch.setattr(build, "initial_state", lambda made: jnp.zeros(()))
     step = lambda env, state: (state + 1, {})  # noqa: E731
