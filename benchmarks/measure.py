@@ -157,8 +157,10 @@ def emit(line: Mapping[str, Any]) -> None:
       line: from `run`, or alike. Added are the peak of matrix products, the machine, and its mean
         load in the minute before this process began.
     """
-    beside = {
+    beside: dict[str, Any] = {
         "matmul_peak_flops_per_s": matmul_peak(),
         "load_before": round(_LOAD_BEFORE, 2),
     }
-    print(json.dumps({**line, **beside, "machine": machine.describe()}), flush=True)
+    beside["machine"] = machine.describe()
+    # What a line says already, of another process, stays.
+    print(json.dumps({**line, **beside, **line}), flush=True)

@@ -9,6 +9,7 @@ whose throughput is within a fifth of the best on its axis. The status is 1 wher
 from __future__ import annotations
 
 import dataclasses
+import functools
 import json
 import math
 import os
@@ -27,6 +28,7 @@ from carljax import presets
 from carljax.sim import towns as bundled
 from carljax.sim.raster_canvas import RasterConfig
 from carljax.sim.road_network import MapError
+from carljax.sim.route_generator import RouteError
 from carljax.sim.town import Town, load
 
 Axis = Literal["agents", "envs", "image", "maps", "devices"]
@@ -79,13 +81,13 @@ def main() -> int:
         check(command)
         for axis in command.axes:
             points = []
-            for point in with_ratios(AXES[axis](command)):
-                measure.emit({**point, "axis": axis})
-                points.append(point)
+            for made in with_ratios(AXES[axis](command)):
+                measure.emit({**made, "axis": axis})
+                points.append(made)
             verdict = judge(axis, points)
             holds &= verdict["holds"] is not False
             measure.emit(verdict)
-    except UsageError as error:
+    except (UsageError, RouteError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
     return 0 if holds else 1
@@ -105,6 +107,9 @@ def check(command: Command) -> None:
     for name in ("num_envs", "num_agents", "num_steps", "num_routes"):
         if getattr(command, name) < 1:
             raise UsageError(f"--{name.replace('_', '-')} {getattr(command, name)}: is below 1")
+    if "maps" in command.axes:
+        for name in command.maps:
+            town(name)
 
 
 def with_ratios(points: Iterator[Point]) -> Iterator[Point]:
@@ -179,7 +184,7 @@ def image(command: Command) -> Iterator[Point]:
     """The observation with more and more pixels; a smaller image sees less far."""
     towns = [load(bundled.path(name)) for name in bundled.TRAINING]
     for side in command.sides:
-        raster = RasterConfig(side, side, ego_from_bottom_px=round(0.4 * side))
+        raster = RasterConfig(side, side, ego_from_bottom_px=round(side * 100 / 256))
         env = workloads.environment(
             presets.CPU, towns, command.num_routes, IMAGE_AGENTS, raster=raster
         )
@@ -201,6 +206,7 @@ def maps(command: Command) -> Iterator[Point]:
             yield {**made, "map": there.network.name, "atlas_shape": pixels}
 
 
+@functools.cache
 def town(name: str) -> Town:
     """Reads a bundled town by name, or a file.
 
@@ -222,12 +228,13 @@ def devices(command: Command) -> Iterator[Point]:
         ran = subprocess.run(
             [sys.executable, str(THROUGHPUT), *asked],
             env={**os.environ, "JAX_PLATFORMS": "cpu", "XLA_FLAGS": flags.strip()},
-            stdout=subprocess.PIPE,
+            capture_output=True,
             text=True,
             check=False,
         )
         if ran.returncode:
-            raise UsageError(f"--devices {num}: {THROUGHPUT.name} failed, see above")
+            said = ran.stderr.strip().splitlines() or ["no message"]
+            raise UsageError(f"--devices {num}: {THROUGHPUT.name} failed: {said[-1]}")
         line = json.loads(ran.stdout)
         cost = line["seconds"]["median"]
         yield {**line, "benchmark": "scaling", "series": "end_to_end", "size": num, "cost_s": cost}
