@@ -168,7 +168,7 @@ def run_rounds(
       Rates of BASE and of NEW.
 
     Raises:
-      CompareError: a run failed, or ran another package than its own.
+      CompareError: a run failed.
     """
     for number in range(command.rounds):
         order = (0, 1) if number % 2 == 0 else (1, 0)

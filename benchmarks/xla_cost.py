@@ -19,7 +19,7 @@ _COMPUTATION = re.compile(r"^(?:ENTRY )?%?([\w.\-]+) \(.*\{$")
 _TRIPS = re.compile(r'"known_trip_count":\{"n":"(\d+)"\}')
 _BODY = re.compile(r"\bbody=%?([\w.\-]+)")
 _CALLED = re.compile(r"\b(?:calls|to_apply|body|condition|\w+_computation)=%?([\w.\-]+)")
-_BRANCHES = re.compile(r"\bbranch_computations=\{([^}]*)\}")
+_SEVERAL = re.compile(r"\b(?:branch|called)_computations=\{([^}]*)\}")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -115,10 +115,10 @@ def loops(computations: dict[str, list[str]]) -> list[Loop]:
 
 def _called(line: str) -> list[str]:
     """Computations that an instruction runs."""
-    branches = [
-        name.strip().lstrip("%") for names in _BRANCHES.findall(line) for name in names.split(",")
+    several = [
+        name.strip().lstrip("%") for names in _SEVERAL.findall(line) for name in names.split(",")
     ]
-    return [*_CALLED.findall(line), *branches]
+    return [*_CALLED.findall(line), *several]
 
 
 def _cost_of(computations: dict[str, list[str]], body: str) -> dict[str, float]:

@@ -122,6 +122,17 @@ def test_a_loop_of_unknown_length_counts_once_and_is_reported():
     assert cost["flops"] == pytest.approx(2 * 64**3, rel=0.05)
 
 
+def test_what_a_custom_call_runs_is_found():
+    """XLA:CPU has a call of its own for the largest values, which names how to compare them."""
+
+    def largest(x):
+        return jax.lax.fori_loop(0, 3, lambda _, x: x * jax.lax.top_k(x, 2)[0].sum(), x)
+
+    compiled = measure.jit(largest).trace(jnp.ones(64)).lower().compile()
+    assert "TopK" in compiled.as_text()
+    assert xla_cost.of(compiled)["loops"] == "all runs"
+
+
 def test_a_workload_becomes_a_line(monkeypatch):
     monkeypatch.setattr(measure, "matmul_peak", lambda: 1000.0)
     monkeypatch.setattr(timing, "call_seconds", lambda *_: [4.0, 1.0, 2.0, 3.0, 5.0])
@@ -248,6 +259,29 @@ def test_growth_is_judged_from_where_the_cores_are_full():
     slow = list(scaling.with_ratios(iter([point(1, 1.0), point(2, 2.3)])))
     assert scaling.judge("agents", slow)["holds"] is False
     assert scaling.judge("devices", slow)["holds"] is None
+
+
+def test_devices_are_made_in_processes_of_their_own(monkeypatch, capsys):
+    seen = []
+
+    def run(command, env, **_):
+        seen.append((command[-6:], env["XLA_FLAGS"].split()[-1], env["JAX_PLATFORMS"]))
+        line = {"benchmark": "end_to_end", "seconds": {"median": 2.0}, "machine": "the child's"}
+        return subprocess.CompletedProcess(command, 0, json.dumps(line), "")
+
+    monkeypatch.setattr(scaling.subprocess, "run", run)
+    monkeypatch.setattr(measure, "matmul_peak", lambda: 1.0)
+    monkeypatch.setattr(measure.machine, "describe", dict)
+    args = ["--axes", "devices", "--devices", "1", "2", "--repeats", "6"]
+    monkeypatch.setattr(sys, "argv", ["scaling", *args])
+    assert scaling.main() == 0
+    flag = "--xla_force_host_platform_device_count"
+    asked = ["--num-devices", "2", "--repeats", "6", "--num-routes", "32"]
+    assert seen[1] == (asked, f"{flag}=2", "cpu")
+    lines = [json.loads(text) for text in capsys.readouterr().out.splitlines()]
+    assert [line.get("cost_ratio") for line in lines] == [None, 1.0, None]
+    assert lines[1]["machine"] == "the child's" and lines[1]["size"] == 2
+    assert lines[2]["holds"] is None
 
 
 def test_points_are_compared_within_their_series():
