@@ -56,9 +56,9 @@ class Encoder(nn.Module):
         self.num_features = channels * size[0] * size[1]
 
     def forward(self, raster: torch.Tensor) -> torch.Tensor:
-        """Maps (N, H, W, C) uint8 to (N, features) float32."""
-        x = raster.float().permute(0, 3, 1, 2)  # in memory still N, H, W, C
+        """Maps (N, H, W, C) uint8 to (N, features) of the weights' type."""
         convs: Any = self.convs
+        x = raster.to(convs[0].weight.dtype).permute(0, 3, 1, 2)  # in memory still N, H, W, C
         for i, conv in enumerate(convs):
             if any(self.padding[i]):
                 x = functional.pad(x, self.padding[i])

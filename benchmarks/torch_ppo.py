@@ -32,6 +32,11 @@ class Samples:
         fields = dataclasses.fields(self)
         return Samples(**{field.name: getattr(self, field.name)[rows] for field in fields})
 
+    def double(self) -> Samples:
+        """The same in float64; images stay bytes."""
+        values = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+        return Samples(**{k: v if k == "raster" else v.double() for k, v in values.items()})
+
 
 def samples_of(minibatch: Minibatch) -> Samples:
     """Our samples as PyTorch's tensors."""
