@@ -14,6 +14,7 @@ import functools
 import importlib.util
 import multiprocessing
 import os
+import queue
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
@@ -152,7 +153,8 @@ def opencv(
       num_scenes: scenes, the same for all.
 
     Yields:
-      draw(frames of each process) -> s from the first one's begin to the last one's end.
+      draw(frames of each process) -> s from the first one's begin to the last one's end; it raises
+      `UsageError` where a process has ended.
     """
     context = multiprocessing.get_context("spawn")
     tasks, results, barrier = context.Queue(), context.Queue(), context.Barrier(processes)
@@ -162,7 +164,13 @@ def opencv(
     def draw(num_frames: int) -> float:
         for _ in workers:
             tasks.put(num_frames)
-        spans = [results.get() for _ in workers]
+        spans: list[tuple[float, float]] = []
+        while len(spans) < processes:
+            try:
+                spans.append(results.get(timeout=1.0))
+            except queue.Empty:
+                if not all(worker.is_alive() for worker in workers):
+                    raise UsageError("a process that draws with OpenCV has ended") from None
         return max(end for _, end in spans) - min(begin for begin, _ in spans)
 
     for worker in workers:
@@ -173,7 +181,8 @@ def opencv(
         for _ in workers:
             tasks.put(0)
         for worker in workers:
-            worker.join()
+            worker.join(timeout=5.0)
+            worker.terminate()  # where another one's end has left it waiting
 
 
 if __name__ == "__main__":
