@@ -1,4 +1,4 @@
-"""Four CPU devices and one compilation cache for all tests; private data where it is present."""
+"""Eight CPU devices and one compilation cache for all tests; private data where it is present."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pathlib import Path
 # All three are read when jax is first imported, which the imports below and the test modules do.
 os.environ["JAX_PLATFORMS"] = "cpu"
 os.environ["XLA_FLAGS"] = (
-    os.environ.get("XLA_FLAGS", "") + " --xla_force_host_platform_device_count=4"
+    os.environ.get("XLA_FLAGS", "") + " --xla_force_host_platform_device_count=8"
 ).strip()
 # Tests compile the same programs again and again. Set once: workers of pytest-xdist inherit it.
 OWN_CACHE = None

@@ -148,7 +148,7 @@ def test_the_saved_configuration_is_the_one_that_ran(runs):
         (["--resume", "straight", "--ppo.gamma", "0.9"], "ppo.gamma: is 0.99 in the run"),
         (["--resume", "straight", "--run.seed", "5"], "run.seed: is 0 in the run"),
         (["--ppo.num-envs", "3", "--run.num-devices", "2"], "ppo.num_envs is 3"),
-        (["--run.num-devices", "9"], "run.num_devices: 9 devices were asked for, but there are 4"),
+        (["--run.num-devices", "9"], "run.num_devices: 9 devices were asked for, but there are 8"),
         (["--run.keep-checkpoints", "0"], "run.keep_checkpoints: 0 is below"),
         (["--map", "missing.xodr"], "missing.xodr"),
     ],
@@ -168,6 +168,21 @@ def test_unknown_words_are_refused_with_status_2(arguments):
     with pytest.raises(SystemExit) as caught:
         train.main(arguments)
     assert caught.value.code == 2
+
+
+def test_a_run_without_a_checkpoint_begins_anew(tmp_path, monkeypatch):
+    monkeypatch.setattr(build, "environment", once(build.environment))
+    begun = []
+
+    def begins(made, state, path, console):
+        begun.append(int(state.update))
+        return state
+
+    monkeypatch.setattr(train.learn, "learn", begins)
+    folder = str(tmp_path / "run")
+    assert train.main([*TINY, "--run.dir", folder]) == 0
+    assert train.main(["--resume", folder]) == 0
+    assert begun == [0, 0]
 
 
 def test_a_map_that_changed_is_not_continued_with(tmp_path):

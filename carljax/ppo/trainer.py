@@ -31,6 +31,7 @@ from carljax.ppo.update import (
     update,
 )
 from carljax.sim.autoreset import Env
+from carljax.sim.types import State
 
 _PLACES: dict[str, Any] = {
     "params": PartitionSpec(),
@@ -46,11 +47,31 @@ TrainStep = Callable[[Env, TrainState], tuple[TrainState, dict[str, jax.Array]]]
 
 
 def make_mesh(num_devices: int | None = None) -> Mesh:
-    """Returns a mesh of the first devices (all by default) with the one axis "data"."""
+    """Makes the mesh of the one axis "data", over as many devices of each process.
+
+    Args:
+      num_devices: of all processes together, the first ones of each; all by default.
+
+    Returns:
+      The mesh, a process's devices side by side.
+
+    Raises:
+      ValueError: there are fewer, or the processes can't have equally many.
+    """
     devices = jax.devices()
-    if num_devices is not None and not 1 <= num_devices <= len(devices):
-        raise ValueError(f"{num_devices} devices were asked for, but there are {len(devices)}")
-    return Mesh(np.array(devices[:num_devices]), (AXIS,))
+    wanted = len(devices) if num_devices is None else num_devices
+    if not 1 <= wanted <= len(devices):
+        raise ValueError(f"{wanted} devices were asked for, but there are {len(devices)}")
+    processes = sorted({device.process_index for device in devices})
+    each = wanted // len(processes)
+    chosen = [
+        device
+        for process in processes
+        for device in [one for one in devices if one.process_index == process][:each]
+    ]
+    if len(chosen) != wanted:
+        raise ValueError(f"{wanted} devices can't be shared equally by {len(processes)} processes")
+    return Mesh(np.array(chosen), (AXIS,))
 
 
 def shardings(mesh: Mesh) -> TrainState:
@@ -63,14 +84,27 @@ def shardings(mesh: Mesh) -> TrainState:
 
 
 def replicate(tree: Any, mesh: Mesh) -> Any:
-    """Copies arrays to every device, once; else each call of the train step would do it."""
-    return jax.device_put(tree, NamedSharding(mesh, PartitionSpec()))
+    """Copies arrays to every device, once; else each call of the train step would do it.
+
+    Of several processes each copies its own arrays, equal to those of the others, to its devices.
+    """
+    place = NamedSharding(mesh, PartitionSpec())
+    if place.is_fully_addressable:
+        return jax.device_put(tree, place)
+
+    def copy(x: Any) -> jax.Array:
+        whole = np.asarray(jnp.asarray(x))
+        return jax.make_array_from_process_local_data(place, whole, whole.shape)
+
+    return jax.tree.map(copy, tree)
 
 
 def init(
     key: jax.Array, env: Env, network: ActorCritic, config: PPOConfig, mesh: Mesh
 ) -> TrainState:
     """Makes the first training state, each part where the train step wants it.
+
+    Each device starts the environments that it will step, and nothing is sent between devices.
 
     Args:
       key: PRNG key of the run.
@@ -87,11 +121,20 @@ def init(
     """
     config.validate(mesh.size)
 
+    start = jax.shard_map(
+        functools.partial(_local_start, num_envs=config.num_envs // mesh.size),
+        mesh=mesh,
+        in_specs=PartitionSpec(),
+        out_specs=PartitionSpec(AXIS),
+        check_vma=False,
+    )
+
     def build(key: jax.Array, env: Env) -> TrainState:
         key_params, key_env, key_run = jax.random.split(key, 3)
-        keys = _env_keys(key_env, jnp.arange(config.num_envs))
-        env_state = jax.vmap(lambda key: env.observe(env.start(key)))(keys)
-        params = network.init(key_params, jax.tree.map(lambda x: x[:1], env_state.obs))
+        env_state = start(env, key_env)
+        # Of an observation the parameters take the shape alone.
+        like = jax.tree.map(lambda x: jnp.zeros((1, *x.shape[1:]), x.dtype), env_state.obs)
+        params = network.init(key_params, like)
         return TrainState(
             params=params,
             opt_state=make_optimizer(config).init(params),
@@ -188,6 +231,13 @@ def _sharded_step(network: ActorCritic, config: PPOConfig, mesh: Mesh) -> TrainS
         out_specs=(_SPEC, PartitionSpec()),
         check_vma=False,
     )
+
+
+def _local_start(env: Env, key: jax.Array, num_envs: int) -> State:
+    """The first states of this device's environments, (num_envs,) in front."""
+    first = jax.lax.axis_index(AXIS) * num_envs
+    keys = _env_keys(key, first + jnp.arange(num_envs))
+    return jax.vmap(lambda key: env.observe(env.start(key)))(keys)
 
 
 def _local_step(
@@ -310,7 +360,7 @@ def compiler_options(platform: str) -> dict[str, Any] | None:
 
 @functools.cache
 def _is_known(options: Sequence[tuple[str, Any]]) -> bool:
-    with jax.default_device(jax.devices("cpu")[0]):
+    with jax.default_device(jax.local_devices(backend="cpu")[0]):
         probe = jax.jit(lambda x: x, compiler_options=dict(options))
         try:
             probe(np.float32(0.0))

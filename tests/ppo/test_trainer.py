@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from pathlib import Path
 
 import chex
@@ -35,7 +36,8 @@ CONFIG = PPOConfig(
     clip_coef=0.2,
     clip_vloss=None,
 )
-
+# For programs that run but twice: machine code that is made fast, not good.
+HASTY = {"xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_passes": True}
 
 COMPILATIONS = []
 
@@ -51,13 +53,16 @@ jax.monitoring.register_event_duration_secs_listener(_listen)
 class Run:
     """A compiled train step and what it needs."""
 
-    def __init__(self, num_devices):
+    def __init__(self, num_devices, compiler_options=None):
         self.mesh = trainer.make_mesh(num_devices)
         self.env = trainer.replicate(toy_env.make(), self.mesh)
         self.first = trainer.init(jax.random.key(0), self.env, NETWORK, CONFIG, self.mesh)
+        chex.clear_trace_counter()  # it can't tell the train steps of several runs apart
         with pytest.MonkeyPatch.context() as patch:
             traced = chex.assert_max_traces(trainer._local_step, n=1)
             patch.setattr(trainer, "_local_step", traced)
+            if compiler_options is not None:
+                patch.setattr(trainer, "compiler_options", lambda platform: compiler_options)
             self.train_step = trainer.make_train_step(NETWORK, CONFIG, self.mesh)
         later, _ = self.updates(self.copy(self.first), 1)
         before = len(COMPILATIONS)
@@ -81,14 +86,24 @@ class Run:
         return train_state, history
 
 
+@functools.cache
+def _run(num_devices):
+    return Run(num_devices, HASTY if num_devices in (2, 8) else None)
+
+
 @pytest.fixture(scope="module")
 def one_device():
-    return Run(1)
+    return _run(1)
 
 
 @pytest.fixture(scope="module")
 def four_devices():
-    return Run(4)
+    return _run(4)
+
+
+@pytest.fixture(scope="module", params=[2, 4, 8])
+def several_devices(request):
+    return _run(request.param)
 
 
 def _is_key(x):
@@ -204,18 +219,19 @@ def test_runs_with_other_keys_differ(one_device):
     assert first[0]["rollout/reward"] != second[0]["rollout/reward"]
 
 
-def test_four_devices_do_what_one_does(one_device, four_devices):
+def test_several_devices_do_what_one_does(one_device, several_devices):
+    chex.assert_trees_all_equal(_data(one_device.first), _data(several_devices.first))
     states, metrics = zip(
-        *[run.updates(run.start(), 2) for run in (one_device, four_devices)], strict=True
+        *[run.updates(run.start(), 2) for run in (one_device, several_devices)], strict=True
     )
-    one, four = map(_data, states)
+    one, several = map(_data, states)
     chex.assert_trees_all_close(
-        one.env_state.pipeline_state, four.env_state.pipeline_state, atol=1e-3
+        one.env_state.pipeline_state, several.env_state.pipeline_state, atol=1e-3
     )
     for before, after in zip(*metrics, strict=True):
         for name, value in before.items():
             np.testing.assert_allclose(value, after[name], rtol=2e-3, atol=1e-4, err_msg=name)
-    chex.assert_trees_all_close(one.params, four.params, atol=1e-3)
+    chex.assert_trees_all_close(one.params, several.params, atol=1e-3)
     moved = jax.tree.map(
         lambda a, b: np.max(np.abs(a - b)), one.params, _data(one_device.first.params)
     )
@@ -259,7 +275,7 @@ def test_derived_sizes():
 
 
 def test_more_devices_than_there_are():
-    with pytest.raises(ValueError, match="99 devices were asked for, but there are 4"):
+    with pytest.raises(ValueError, match="99 devices were asked for, but there are 8"):
         trainer.make_mesh(99)
 
 
