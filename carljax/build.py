@@ -202,5 +202,5 @@ def estimate_memory(made: Setup) -> tuple[int, MemoryEstimate]:
     }
     available = machine.device_memory()
     if jax.default_backend() == "cpu":
-        available //= num_devices
+        available //= made.mesh.local_mesh.size
     return memory.count(state.params), MemoryEstimate(parts, available)

@@ -60,7 +60,8 @@ class RunConfig:
     """Bank of routes to train on, from `python -m carljax.routes make`; repeatable, one at least
     for each town. None: routes are drawn."""
     num_devices: int | None = None
-    """Accelerators or CPU devices to share the environments among; all by default."""
+    """Accelerators or CPU devices to share the environments among, of all processes together and
+    equally many of each; all by default."""
     log_every: int = 1
     """Updates between two lines of metrics.jsonl."""
     checkpoint_every: int = 50

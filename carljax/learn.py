@@ -6,14 +6,14 @@ import math
 import signal
 import time
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from types import FrameType
 
 import jax
 from rich.console import Console
 
-from carljax import checkpoint, metrics_log
+from carljax import checkpoint, distributed, metrics_log
 from carljax.build import Setup
 from carljax.metrics_log import MetricsLog, Report, WindowMean
 from carljax.ppo import trainer
@@ -26,7 +26,8 @@ def learn(made: Setup, state: TrainState, path: Path, console: Console) -> Train
     """Makes updates until the run is complete or the user interrupts.
 
     The first interrupt ends the loop after the current update, with a checkpoint; a second one ends
-    the program at once.
+    the program at once. Of several processes all stop after the same update, whichever of them is
+    interrupted; the first one logs, and all save together.
 
     Args:
       made: see `build.setup`.
@@ -40,9 +41,10 @@ def learn(made: Setup, state: TrainState, path: Path, console: Console) -> Train
     run, ppo = made.config.run, made.config.ppo
     start = int(state.update)
     train_step = trainer.make_train_step(made.network, ppo, made.mesh)
-    window = WindowMean(run.best_window, [line.get(SCORE) for line in metrics_log.read(path)])
+    before_start = [line for line in metrics_log.read(path) if line["update"] <= start]
+    window = WindowMean(run.best_window, [line.get(SCORE) for line in before_start])
     with (
-        MetricsLog(path, start) as log,
+        MetricsLog(path, start) if distributed.is_first() else nullcontext() as log,
         Report(console, start, ppo.num_updates) as report,
         interrupts() as interrupted,
     ):
@@ -54,10 +56,11 @@ def learn(made: Setup, state: TrainState, path: Path, console: Console) -> Train
                 seconds = time.perf_counter() - since
                 metrics |= speed(seconds, (update - before) * ppo.batch_size, update == start + 1)
                 since, before = time.perf_counter(), update
-                log.write(update, update * ppo.batch_size, metrics)
+                if log is not None:
+                    log.write(update, update * ppo.batch_size, metrics)
                 window.add(metrics[SCORE])
                 report.show(update, metrics)
-            last = bool(interrupted) or update == ppo.num_updates
+            last = update == ppo.num_updates or distributed.any_process(bool(interrupted))
             if last or update % run.checkpoint_every == 0:
                 checkpoint.save(path, state, update, window.mean, run.keep_checkpoints)
             if last:

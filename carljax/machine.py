@@ -24,6 +24,7 @@ def describe() -> dict[str, Any]:
         "memory_bytes": host_memory(),
         "backend": jax.default_backend(),
         "devices": [device.device_kind for device in jax.devices()],
+        "processes": jax.process_count(),
     }
 
 
@@ -34,7 +35,7 @@ def host_memory() -> int:
 
 def device_memory() -> int:
     """Memory that one device may use, bytes; devices on the CPU share the host's."""
-    stats = jax.devices()[0].memory_stats() if jax.default_backend() != "cpu" else None
+    stats = jax.local_devices()[0].memory_stats() if jax.default_backend() != "cpu" else None
     return stats["bytes_limit"] if stats else host_memory()
 
 

@@ -3,6 +3,7 @@
 All seeds drive on the same training routes (those of `run.routes_seed`), so the map is held once;
 everything else is each run's own, number for number what it would be alone. While they train there
 is one folder of checkpoints for all; at the end each has its own, as if it had been trained alone.
+All of it is for one process: several hosts (`carljax.distributed`) train one run.
 """
 
 from __future__ import annotations

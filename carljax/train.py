@@ -18,6 +18,7 @@ from carljax import (
     checkpoint,
     config,
     courses,
+    distributed,
     evaluate,
     learn,
     memory,
@@ -28,11 +29,13 @@ from carljax import (
 from carljax.build import Setup
 from carljax.checkpoint import CheckpointError
 from carljax.config import ConfigError, TrainConfig
+from carljax.distributed import Distributed
 from carljax.drive import NetworkPolicy
 from carljax.sim.road_network import MapError
 from carljax.sim.route_generator import RouteError
 
 PROG = "python -m carljax.train"
+USER_ERRORS = (ConfigError, CheckpointError, MapError, RouteError)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -41,10 +44,13 @@ class Command:
 
     config: Annotated[TrainConfig, tyro.conf.arg(name="")]
     resume: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
-    """Continue the run in DIR exactly; of its configuration only --run.* (but for seed, map and
-    num-routes) and --ppo.total-samples may change."""
+    """Continue the run in DIR exactly, from the beginning if it has no checkpoint yet; of its
+    configuration only --run.* (but for seed, map and num-routes) and --ppo.total-samples may
+    change."""
     dry_run: bool = False
     """Build everything, print configuration, size and memory, and stop."""
+    distributed: Distributed = Distributed()
+    """Several processes, on one or several hosts, that train as one."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -56,10 +62,15 @@ def main(argv: Sequence[str] | None = None) -> int:
     Returns:
       Exit status: 2 after a mistake in what the user gave, said in one line.
     """
+    given = sys.argv[1:] if argv is None else list(argv)
     try:
-        return run(parse(sys.argv[1:] if argv is None else list(argv)), Console())
-    except (ConfigError, CheckpointError, MapError, RouteError) as error:
-        print(f"error: {error}", file=sys.stderr)
+        with distributed.joined(distributed.read(given), USER_ERRORS):
+            with distributed.agreed():
+                command = parse(given)
+            return run(command, Console(quiet=not distributed.is_first()))
+    except USER_ERRORS as error:
+        if distributed.is_first():
+            print(f"error: {error}", file=sys.stderr)
         return 2
 
 
@@ -120,24 +131,24 @@ def run(command: Command, console: Console) -> int:
       Exit status.
     """
     wanted = command.config
-    path = wanted.run.dir or run_dir.default_path()
+    path = wanted.run.dir or Path(distributed.gather(str(run_dir.default_path()))[0])
     maps = tuple(file.resolve() for file in wanted.run.maps)
     banks = tuple(file.resolve() for file in wanted.run.routes)
     wanted = _with_run(wanted, dir=path, maps=maps, routes=banks)
     if wanted.run.compile_cache is not None:
         jax.config.update("jax_compilation_cache_dir", str(wanted.run.compile_cache.resolve()))
-    if command.resume is None:
-        run_dir.check_free(path)
-    made = build.setup(wanted)
+    with distributed.agreed():
+        if command.resume is None and distributed.is_first():
+            run_dir.check_free(path)
+        made = build.setup(wanted)
+    distributed.check_same("arguments, maps or routes", str(config.to_json(wanted)), made.env)
     describe(made, console)
     if command.dry_run:
         return 0
     state = build.initial_state(made)
-    if command.resume is None:
-        run_dir.create(path, wanted)
-    else:
+    if command.resume is not None and checkpoint.updates(path):
         state = checkpoint.restore(path, like=state)
-        run_dir.reopen(path, wanted)
+    open_run(path, wanted, is_new=command.resume is None)
     state = learn.learn(made, state, path, console)
     if int(state.update) < wanted.ppo.num_updates:
         console.print(f"stopped; continue with: {PROG} --resume {path}")
@@ -148,8 +159,26 @@ def run(command: Command, console: Console) -> int:
     return 0
 
 
+def open_run(path: Path, wanted: TrainConfig, is_new: bool) -> None:
+    """Notes in the run's directory that it begins or goes on, once for all processes.
+
+    Raises:
+      ConfigError: a map has changed, or the processes don't share the directory.
+    """
+    with distributed.agreed():
+        if distributed.is_first():
+            (run_dir.create if is_new else run_dir.reopen)(path, wanted)
+    with distributed.agreed():
+        if not (path / run_dir.CONFIG_FILE).exists():
+            raise ConfigError(f"{path}: does not hold what process 0 has written: not shared?")
+
+
 def score(made: Setup, params: Any, path: Path, console: Console) -> None:
-    """Evaluates the policy on held-out routes; prints the table and writes evaluation.json."""
+    """Evaluates the policy on held-out routes; prints the table and writes evaluation.json.
+
+    Of several processes each drives all routes, on one device of its own, so that none has to wait
+    for another; the first one prints and writes.
+    """
     course = courses.held_out(made.config, made.towns, made.config.run.eval_routes)
     since = time.perf_counter()
     action = made.config.run.eval_action
@@ -157,6 +186,8 @@ def score(made: Setup, params: Any, path: Path, console: Console) -> None:
     result = evaluate.evaluate(course, policy)
     seconds = time.perf_counter() - since
     score_table.show(result, console, title=course.title)
+    if not distributed.is_first():
+        return
     evaluate.save(result, path / evaluate.FILE, seconds, course=course.title, action=action)
 
 
@@ -172,7 +203,9 @@ def describe(made: Setup, console: Console) -> None:
     console.print(f"towns       {names}")
     console.print(f"parameters  {num_parameters:,}")
     console.print(f"updates     {ppo.num_updates:,} of {ppo.batch_size:,} samples")
-    console.print(f"devices     {made.mesh.size} x {devices[0].device_kind}")
+    processes = distributed.num_processes()
+    of_processes = f", of {processes} processes" if processes > 1 else ""
+    console.print(f"devices     {made.mesh.size} x {devices[0].device_kind}{of_processes}")
     console.print("memory of one device, estimated:")
     for what, size in estimate.parts.items():
         console.print(f"  {memory.readable(size):>9}  {what}")
