@@ -149,7 +149,8 @@ def _join(flags: Distributed) -> None:
     except (ValueError, RuntimeError, KeyError) as error:
         reason = str(error).strip().split("\n", 1)[0]
         if not flags.is_explicit:
-            reason += "; where no cluster tells, give --distributed.coordinator-address and so on"
+            names = ", ".join(flags._values())
+            reason = f"no cluster tells who takes part ({reason}); give {names}"
         raise ConfigError(f"--distributed: {reason}") from error
     # JAX listens to SIGTERM from here on. `learn.interrupts` does so itself.
     signal.signal(signal.SIGTERM, signal.getsignal(signal.SIGTERM))

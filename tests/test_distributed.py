@@ -201,7 +201,10 @@ def test_flags_are_read_ahead_of_the_rest():
 @pytest.mark.parametrize(
     ("given", "reason"),
     [
-        (["--distributed"], "no address; where no cluster tells, give --distributed.coordinator"),
+        (
+            ["--distributed"],
+            "no cluster tells who takes part (no address); give --distributed.coordinator",
+        ),
         ([f"--distributed.{k}={v}" for k, v in ALL.items()], "no address"),
     ],
 )
