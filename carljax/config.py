@@ -18,6 +18,7 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from carljax import atomic
+from carljax.compile_cache import CacheFolder
 from carljax.ppo.config import NetworkConfig, PPOConfig
 from carljax.reward.config import RewardConfig
 from carljax.sim.env import EnvConfig
@@ -76,8 +77,9 @@ class RunConfig:
     eval_action: Action = "mean"
     """Action in that evaluation, and by default in `carljax.evaluate`: mean of the policy (CaRL),
     its mode (Roach), or a sample as in training."""
-    compile_cache: Path | None = None
-    """Folder for JAX's persistent compilation cache; none by default."""
+    compile_cache: CacheFolder = None
+    """Folder for compiled programs, or `off` for none; the user's cache folder by default. The
+    variable JAX_COMPILATION_CACHE_DIR comes before it."""
 
     def validate(self) -> None:
         """Checks that counts are counts.

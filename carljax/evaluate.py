@@ -21,9 +21,20 @@ import numpy as np
 import tyro
 from rich.console import Console
 
-from carljax import atomic, build, checkpoint, courses, drive, machine, result_file, run_dir
+from carljax import (
+    atomic,
+    build,
+    checkpoint,
+    compile_cache,
+    courses,
+    drive,
+    machine,
+    result_file,
+    run_dir,
+)
 from carljax import score_table as table
 from carljax.checkpoint import CheckpointError
+from carljax.compile_cache import CacheFolder
 from carljax.config import Action, ConfigError, TrainConfig
 from carljax.courses import Course
 from carljax.drive import NetworkPolicy, PlannerPolicy, Policy, Run
@@ -56,10 +67,11 @@ def evaluate(course: Course, policy: Policy, repetitions: int = 1) -> EvalResult
       The scores.
     """
     drive_all = drive.compiled(_drive_all)
+    episodes = jnp.arange(len(course.route_ids))
     routes: list[RouteScore] = []
     for repetition in range(repetitions):
         key = jax.random.key(TRAFFIC_SEED + repetition)
-        ended: Drive = jax.device_get(drive_all(policy, course.env, key))
+        ended: Drive = jax.device_get(drive_all(policy, course.env, episodes, key))
         routes += [
             _score(course, jax.tree.map(lambda x, i=i: x[i], ended), i, repetition)
             for i in range(len(course.route_ids))
@@ -67,8 +79,8 @@ def evaluate(course: Course, policy: Policy, repetitions: int = 1) -> EvalResult
     return EvalResult(tuple(routes))
 
 
-def _drive_all(policy: Policy, env: DrivingEnv, key: jax.Array) -> Drive:
-    """Drives until all routes have ended; (B,) drives as they ended, without key and images."""
+def _drive_all(policy: Policy, env: DrivingEnv, episodes: jax.Array, key: jax.Array) -> Drive:
+    """Drives (B,) episodes until all have ended; (B,) as they ended, without key and images."""
 
     def is_any_running(run: Run) -> jax.Array:
         return jnp.any(run.drive.state.done == 0)
@@ -76,7 +88,7 @@ def _drive_all(policy: Policy, env: DrivingEnv, key: jax.Array) -> Drive:
     def again(run: Run) -> Run:
         return drive.step(policy, env, run)[0]
 
-    run = drive.start(policy, env, jnp.arange(env.bank.num_episodes), key)
+    run = drive.start(policy, env, episodes, key)
     ended = jax.lax.while_loop(is_any_running, again, run).drive
     sim = ended.state.pipeline_state.replace(key=None)
     return ended.replace(state=ended.state.replace(pipeline_state=sim, obs=None))
@@ -183,6 +195,8 @@ class Command:
     """Draw one route here."""
     gif_route: int = 0
     """Which of the routes to draw."""
+    compile_cache: CacheFolder = None
+    """Folder for compiled programs, or `off` for none; the user's cache folder by default."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -220,6 +234,7 @@ def run(command: Command, console: Console) -> int:
     """
     _check(command)
     config = _config(command)
+    compile_cache.enable(command.compile_cache)
     course = _course(command, config)
     if command.gif is not None and not 0 <= command.gif_route < len(course.route_ids):
         raise ConfigError(

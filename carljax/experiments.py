@@ -28,6 +28,7 @@ from carljax import (
     atomic,
     build,
     checkpoint,
+    compile_cache,
     courses,
     evaluate,
     experiment_report,
@@ -37,6 +38,7 @@ from carljax import (
 )
 from carljax import config as config_module
 from carljax.ablations import ABLATIONS, Cell
+from carljax.compile_cache import CacheFolder
 from carljax.config import HELD_OUT_SEED, Action, ConfigError, TrainConfig
 from carljax.courses import Course
 from carljax.drive import NetworkPolicy
@@ -81,6 +83,8 @@ class Command:
     """Where everything is kept; experiments/NAME by default."""
     seeds_at_once: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
     """Seeds trained in one program; as many as fit into the memory by default."""
+    compile_cache: CacheFolder = None
+    """Folder for compiled programs, or `off` for none; the user's cache folder by default."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -118,6 +122,7 @@ def run(command: Command, console: Console) -> int:
     for cell in ablation.cells:
         config = ablations.configure(cell, base, 1)
         config.validate(config.run.num_devices or jax.device_count())
+    compile_cache.enable(command.compile_cache)
     plan = _plan(ablation.cells, base, command, folder / PLAN_FILE, console)
     console.print(f"{ablation.title}: {len(plan)} cells, {command.seeds} seeds, {folder}")
     for cell, config in plan:

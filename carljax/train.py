@@ -16,6 +16,7 @@ from rich.console import Console
 from carljax import (
     build,
     checkpoint,
+    compile_cache,
     config,
     courses,
     distributed,
@@ -134,9 +135,9 @@ def run(command: Command, console: Console) -> int:
     path = wanted.run.dir or Path(distributed.gather(str(run_dir.default_path()))[0])
     maps = tuple(file.resolve() for file in wanted.run.maps)
     banks = tuple(file.resolve() for file in wanted.run.routes)
-    wanted = _with_run(wanted, dir=path, maps=maps, routes=banks)
-    if wanted.run.compile_cache is not None:
-        jax.config.update("jax_compilation_cache_dir", str(wanted.run.compile_cache.resolve()))
+    cache = compile_cache.absolute(wanted.run.compile_cache)
+    wanted = _with_run(wanted, dir=path, maps=maps, routes=banks, compile_cache=cache)
+    compile_cache.enable(cache)
     with distributed.agreed():
         if command.resume is None and distributed.is_first():
             run_dir.check_free(path)

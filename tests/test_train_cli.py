@@ -204,14 +204,6 @@ def test_a_dry_run_prints_size_and_memory_and_writes_nothing(tmp_path, capsys, m
     assert list(tmp_path.iterdir()) == []
 
 
-def test_the_compile_cache_goes_where_it_is_asked_to(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    asked = []
-    monkeypatch.setattr(train.jax.config, "update", lambda *pair: asked.append(pair))
-    assert train.main([*TINY, "--run.compile-cache", "here", "--dry-run"]) == 0
-    assert asked == [("jax_compilation_cache_dir", str(tmp_path / "here"))]
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["roach", "nuplan"])
 def test_other_observations_train_save_and_go_on(kind, tmp_path, monkeypatch):
