@@ -179,7 +179,7 @@ def measure(
 
 def drive(env: DrivingEnv, driver: str, seed: int, seconds: float) -> Fate:
     """(S,) how a driver fares on each route of an environment."""
-    num = env.bank.num_episodes
+    num = int(env.bank.num_episodes)
     keys = jax.random.split(jax.random.key(seed), num)
     steps = round(seconds / CONFIG.dt)
     return _drive(env, keys, jnp.arange(num), limits(env), driver, steps)

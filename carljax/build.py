@@ -18,7 +18,7 @@ from carljax.ppo.networks import ActorCritic
 from carljax.ppo.rollout import rollout
 from carljax.ppo.types import TrainState
 from carljax.route_bank import BankError
-from carljax.sim import episodes, journey, town, towns
+from carljax.sim import bank_padding, episodes, journey, town, towns
 from carljax.sim.env import DrivingEnv, make_env
 from carljax.sim.journey import Journey
 from carljax.sim.town import Town
@@ -142,7 +142,7 @@ def environment(
         config.env.route_length,
         config.env.scenario_spacing,
     )
-    return make_env(bank, config.env, config.reward)
+    return make_env(bank_padding.pad(bank), config.env, config.reward)
 
 
 def environment_on(
@@ -160,7 +160,7 @@ def environment_on(
       The environment.
     """
     bank = episodes.populate(loaded, journeys, config.env.population, seed)
-    return make_env(bank, config.env, config.reward)
+    return make_env(bank_padding.pad(bank), config.env, config.reward)
 
 
 def initial_state(made: Setup) -> TrainState:

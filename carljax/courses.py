@@ -37,12 +37,12 @@ class Course:
     @property
     def town_of_route(self) -> np.ndarray:
         """(S,) int, place in `towns` of each route."""
-        return np.asarray(self.env.bank.routes.town)
+        return np.asarray(self.env.bank.routes.town)[: len(self.route_ids)]
 
     @property
     def num_scenarios(self) -> np.ndarray:
         """(S,) int, scenarios placed on each route."""
-        return (np.asarray(self.env.bank.scenarios.kind) >= 0).sum(axis=1)
+        return (np.asarray(self.env.bank.scenarios.kind) >= 0).sum(axis=1)[: len(self.route_ids)]
 
 
 def held_out(config: TrainConfig, towns: Sequence[Town], num_routes: int) -> Course:

@@ -20,7 +20,7 @@ from carljax.reward.carl import SOFT_FACTORS
 from carljax.sim import lights
 from carljax.sim.env import DrivingEnv
 from carljax.sim.raster_canvas import RasterConfig
-from carljax.sim.road_map import PIXELS_PER_METRE, RoadMap
+from carljax.sim.road_map import PIXELS_PER_METRE, RoadMap, picture
 from carljax.sim.scenarios import registry
 from carljax.sim.scenarios.script import ScenarioSlots
 from carljax.sim.types import (
@@ -90,7 +90,7 @@ def read_world(env: DrivingEnv, episode_idx: int) -> World:
     route = jax.device_get(jax.tree.map(lambda x: x[episode_idx], routes))
     town, rows = int(route.town), env.config.population
     return World(
-        layers=np.asarray(road_map.layers[town]),
+        layers=picture(road_map, town, road_map.layers),
         origin=np.asarray(road_map.origin[town]),
         route_xy=route.xy[: int(route.num_points)],
         route_yaw=route.yaw,

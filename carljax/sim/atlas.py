@@ -26,6 +26,7 @@ from carljax.sim.road_map import (
     PIXELS_PER_METRE,
 )
 from carljax.sim.road_network import MARK_BROKEN, MARK_SOLID, Lane, RoadNetwork
+from carljax.sim.size_class import SizeClass
 
 # Lane types of OpenDRIVE 1.8 (table "e_laneType") on which a car travels.
 DRIVING_KINDS = frozenset(
@@ -53,6 +54,7 @@ MARK_WIDTH = 1.0
 _SUBPIXELS = 256
 _CHUNK = 2048  # polygons filled by one call of the compiled kernel
 _WINDOWS = (8, 16, 32, 64)  # px; 64 keeps the whole-number edge test inside 32 bits
+_CANVAS = SizeClass(1 << 21, steps=4)  # px, so that pictures of other sizes are no other program
 _MAX_STEP = 8.0  # m, longest piece of a strip; keeps every piece inside the largest window
 
 
@@ -201,10 +203,12 @@ def fill_polygons(corners: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
     Raises:
       ValueError: a polygon spans more than 64 pixels; cut it first.
     """
-    canvas = jnp.zeros(shape[0] * shape[1], jnp.bool_)
+    num = shape[0] * shape[1]
+    canvas = jnp.zeros(_CANVAS.round_up(num), jnp.bool_)
+    size = np.array(shape, np.int32)
     for _, local, first, window in _chunks(corners):
-        canvas = _fill_chunk(canvas, local, first, shape, window)
-    return np.asarray(canvas).reshape(shape)
+        canvas = _fill_chunk(canvas, local, first, size, window)
+    return np.asarray(canvas)[:num].reshape(shape)
 
 
 def covered_pixels(corners: np.ndarray, shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
@@ -260,22 +264,22 @@ def _chunks(corners: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray, np.nd
             )
 
 
-@functools.partial(jax.jit, static_argnames=("shape", "window"), donate_argnums=0)
+@functools.partial(jax.jit, static_argnames="window", donate_argnums=0)
 def _fill_chunk(
     canvas: jax.Array,
     corners: jax.Array,
     first: jax.Array,
-    shape: tuple[int, int],
+    shape: jax.Array,
     window: int,
 ) -> jax.Array:
     """Adds polygons to a flat canvas.
 
     Args:
-      canvas: (rows * columns,) bool.
+      canvas: bool, at least rows * columns.
       corners: (S, V, 2) int32 column and row in 1/256 pixel from the pixel `first`; equal corners
         make an empty polygon.
       first: (S, 2) int32 column and row.
-      shape: rows and columns.
+      shape: (2,) int32 rows and columns.
       window: px, side of the square in which every polygon lies.
     """
     inside = _inside(corners, window)

@@ -14,7 +14,15 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from carljax.sim import crowd, pedestrians, road_map_builder, route_generator, spawn, traffic
+from carljax.sim import (
+    crowd,
+    pedestrians,
+    road_map_builder,
+    road_map_padding,
+    route_generator,
+    spawn,
+    traffic,
+)
 from carljax.sim.journey import Journey, stack_routes, stack_scenarios
 from carljax.sim.population import Population, nobody
 from carljax.sim.road_map import RoadMap
@@ -38,11 +46,12 @@ class EpisodeBank(struct.PyTreeNode):
     """All that stays the same while training: held once per device.
 
     Attributes:
-      road_map: the towns.
+      road_map: the towns, padded to size classes (`road_map_padding`).
       routes: `Route` with a leading axis S.
       agents: `Agents` at the start, with a leading axis S.
       walkers: `Walkers` at the start, with a leading axis S.
       scenarios: `Scenario` with leading axes S, E, in order along each route.
+      num_episodes: () int32, how many of the S rows are episodes; the others are padding.
     """
 
     road_map: RoadMap
@@ -50,11 +59,7 @@ class EpisodeBank(struct.PyTreeNode):
     agents: Agents
     walkers: Walkers
     scenarios: Scenario
-
-    @property
-    def num_episodes(self) -> int:
-        """S."""
-        return self.agents.kind.shape[0]
+    num_episodes: jax.Array
 
 
 def make_bank(
@@ -148,7 +153,7 @@ def populate(
         start, num_walkers = np.asarray(journey.route.xy[0]), population.num_walkers
         crowds.append(crowd.draw(towns[town].walks, firsts[town].walk, start, num_walkers, rng))
     lane, s, speed = (np.stack(values) for values in zip(*agents, strict=True))
-    road_map = road_map_builder.build(towns)
+    road_map = road_map_padding.pad(road_map_builder.build(towns))
     num = len(journeys)
     cars = _initial(
         jnp.asarray(lane, jnp.int32),
@@ -166,6 +171,7 @@ def populate(
         agents=jax.tree.map(lambda *x: jnp.concatenate(x, axis=1), *parts),
         walkers=walkers,
         scenarios=jax.tree.map(jnp.asarray, stack_scenarios(journeys)),
+        num_episodes=jnp.int32(num),
     )
 
 

@@ -18,11 +18,14 @@ from flax import struct
 
 from carljax.sim import atlas
 from carljax.sim.atlas import MARK_WIDTH
-from carljax.sim.road_map import LAYER_ROAD, PIXELS_PER_METRE, RoadMap
+from carljax.sim.road_map import LAYER_ROAD, PIXELS_PER_METRE, RoadMap, picture
 from carljax.sim.route import Route
+from carljax.sim.size_class import SizeClass
 from carljax.sim.types import STOP_NONE
 
 DRIVABLE, BORDER, STOP_LINE = 1, 2, 4  # bits of `NuplanAtlas.kind_bits`
+# Kinds and cells of a town. A table of the kinds is made for every image: little of it is padding.
+KINDS, CELLS = SizeClass(1024, steps=8), SizeClass(1024)
 _PIECES = 4  # most lanes, one behind the other, that a way through a junction is cut into
 
 
@@ -30,7 +33,7 @@ class NuplanAtlas(struct.PyTreeNode):
     """The pixels of M towns and the routes' cells in them; kinds and cells count within a town.
 
     Attributes:
-      pixels: (M, H, W) int32, kind of each pixel; 0 shows nothing.
+      pixels: (X,) int32, kind of each pixel, in the order of `RoadMap.layers`; 0 shows nothing.
       kind_bits: (M, Q) uint8, of the constants above.
       kind_lane: (M, Q) int32, row in the lane table of the centre line there, -1 for none.
       kind_cell: (M, Q) int32, 0 where there is no block.
@@ -57,15 +60,18 @@ def build(road_map: RoadMap, routes: Route) -> NuplanAtlas:
       The atlas.
     """
     world: Any = jax.tree.map(np.asarray, road_map)
-    made = [_town(world, town) for town in range(len(world.layers))]
-    most = max(len(kinds) for _, kinds, _ in made)
-    # Unused kinds show nothing.
-    kinds = [np.pad(k, ((0, most - len(k)), (0, 0))) for _, k, _ in made]
-    bits, lane, cell = np.moveaxis(np.stack(kinds), -1, 0)
+    made = [_town(world, town) for town, size in enumerate(world.picture_size) if size.all()]
+    pixels = np.concatenate([pixels.reshape(-1) for pixels, _, _ in made])
+    # Padding, and kinds that a town lacks, show nothing.
+    pixels = np.pad(pixels, (0, len(world.layers) - len(pixels)))
+    kinds = np.zeros((len(world.origin), KINDS.round_up(max(len(k) for _, k, _ in made)), 3), int)
+    for town, (_, own, _) in enumerate(made):
+        kinds[town, : len(own)] = own
+    bits, lane, cell = np.moveaxis(kinds, -1, 0)
     blocks = [b for _, _, b in made]
     route_blocks = _route_blocks(world, jax.tree.map(np.asarray, routes))
     return NuplanAtlas(
-        pixels=jnp.asarray(np.stack([pixels for pixels, _, _ in made]), jnp.int32),
+        pixels=jnp.asarray(pixels, jnp.int32),
         kind_bits=jnp.asarray(bits, jnp.uint8),
         kind_lane=jnp.asarray(lane - 1, jnp.int32),
         kind_cell=jnp.asarray(cell, jnp.int32),
@@ -76,10 +82,11 @@ def build(road_map: RoadMap, routes: Route) -> NuplanAtlas:
 
 def _town(world: Any, town: int) -> tuple[np.ndarray, np.ndarray, list[np.ndarray]]:
     """A town's pixels (H, W); its kinds (Q, 3): bits, lane + 1, cell; the blocks of each cell."""
-    shape, origin = world.layers[town].shape, world.origin[town].astype(float)
+    layers, origin = picture(world, town, world.layers), world.origin[town].astype(float)
+    shape = layers.shape
     left, right, row = _quads_of(world, town)
     cell, blocks = _cells(left, right, world.point_block[row], origin, shape)
-    bits = np.where(world.layers[town] & LAYER_ROAD, DRIVABLE, 0)
+    bits = np.where(layers & LAYER_ROAD, DRIVABLE, 0)
     outside = ~world.lane_in_junction[world.point_lane[row]]
     borders = np.concatenate([line[outside] for line in (left, right)])
     bits |= _filled(_thick(borders), origin, shape) * BORDER
@@ -95,9 +102,10 @@ def _town(world: Any, town: int) -> tuple[np.ndarray, np.ndarray, list[np.ndarra
 
 def _quads_of(world: Any, town: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The left and the right border of each piece of the town's lanes, (n, 2, 2) m, and its row."""
-    row = np.arange(len(world.point_yaw) - 1)
-    lane = world.point_lane[row]
-    row = row[(lane == world.point_lane[row + 1]) & (world.lane_town[lane] == town)]
+    lanes = np.flatnonzero(world.lane_town == town)
+    pieces = world.lane_num_points[lanes] - 1
+    row = np.repeat(world.lane_start[lanes] - np.cumsum(pieces) + pieces, pieces)
+    row += np.arange(len(row))
     yaw, half = world.point_yaw.astype(float), world.point_width.astype(float)[:, None] / 2
     offset = half * np.stack([-np.sin(yaw), np.cos(yaw)], axis=-1)
     xy = world.point_xy.astype(float)
@@ -150,7 +158,7 @@ def _filled(quads: np.ndarray, origin: np.ndarray, shape: Any) -> np.ndarray:
 
 def _centre_lines(world: Any, town: int, origin: np.ndarray) -> np.ndarray:
     """(H, W) row of the lane whose centre line covers a pixel, the nearest one; -1 elsewhere."""
-    point = world.nearest_point[town]
+    point = picture(world, town, world.nearest_point)
     row, column = np.nonzero(point >= 0)
     at = point[row, column]
     offset = np.stack([column, row], axis=-1) / PIXELS_PER_METRE + origin - world.point_xy[at]
@@ -187,7 +195,7 @@ def _route_blocks(world: Any, routes: Any) -> list[np.ndarray]:
 
 def _on_route(cells: Any, route_blocks: list[np.ndarray], towns: np.ndarray) -> np.ndarray:
     """(S, C) bool, whether one of the route's blocks covers a cell of its town."""
-    out = np.zeros((len(towns), max(len(blocks) for blocks in cells)), bool)
+    out = np.zeros((len(towns), CELLS.round_up(max(len(blocks) for blocks in cells))), bool)
     num_blocks = 1 + max(int(b.max(initial=0)) for blocks in cells for b in blocks)
     for town, blocks in enumerate(cells):
         member = np.concatenate(blocks)

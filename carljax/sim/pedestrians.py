@@ -22,6 +22,7 @@ from carljax.sim.road_map import (
     WALK_TO_CROSSING,
     WALK_TO_JAYWALK,
     RoadMap,
+    grid_cell,
 )
 from carljax.sim.types import KIND_NONE, KIND_PEDESTRIAN, Agents, EgoState, Walkers
 
@@ -208,7 +209,5 @@ def _respawn_node(
     ego: EgoState, town: jax.Array, road_map: RoadMap, key: jax.Array, cell_size: float
 ) -> jax.Array:
     """() int32, one of the nodes listed for the ego's grid cell, -1 for none."""
-    _, rows, columns, candidates = road_map.spawn_walk.shape
-    cell = ((ego.xy - road_map.origin[town]) / cell_size).astype(jnp.int32)
-    column, row = jnp.clip(cell[0], 0, columns - 1), jnp.clip(cell[1], 0, rows - 1)
-    return road_map.spawn_walk[town, row, column, jax.random.randint(key, (), 0, candidates)]
+    pick = jax.random.randint(key, (), 0, road_map.spawn_walk.shape[1])
+    return road_map.spawn_walk[grid_cell(road_map, town, ego.xy, cell_size), pick]

@@ -165,7 +165,7 @@ def _static(
 
     def at(down: float, right: float) -> jax.Array:
         index, inside = raster_road.atlas_index(ego, road_map, route, config, down, right)
-        return jnp.where(inside, atlas.pixels.reshape(-1).at[index].get(**GATHER), 0)
+        return jnp.where(inside, atlas.pixels.at[index].get(**GATHER), 0)
 
     image = table.at[at(0.0, 0.0)].get(**GATHER)
     num = math.ceil(1.0 / config.pixels_per_metre)  # lines are a metre wide

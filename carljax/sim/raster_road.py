@@ -72,7 +72,7 @@ def _static_at(
 ) -> jax.Array:
     """(H, W) uint8: the atlas at each pixel's centre, or so many pixels down and right of it."""
     index, inside = atlas_index(ego, road_map, route, config, down, right)
-    bits = road_map.layers.reshape(-1).at[index].get(**GATHER)
+    bits = road_map.layers.at[index].get(**GATHER)
     return jnp.where(inside, bits & jnp.uint8(ROUTE_BIT - 1), jnp.uint8(0))
 
 
@@ -92,16 +92,16 @@ def atlas_index(
 
     Args:
       ego: pose of the image.
-      road_map: gives the size of the atlases.
+      road_map: gives the place and size of the town's picture.
       route: names the town.
       config: size.
       down: pixels of the image.
       right: pixels of the image.
 
     Returns:
-      (H, W) int32 index into a flat atlas, 0 outside it; (H, W) bool, inside it.
+      (H, W) int32 index into an atlas, 0 outside the town's picture; (H, W) bool, inside it.
     """
-    _, rows, columns = road_map.layers.shape
+    rows, columns = road_map.picture_size[route.town].astype(jnp.uint32)
     # Iota, not constants: with constants XLA's CPU code for this gather is eight times slower.
     row = jnp.arange(config.height, dtype=jnp.int32)[:, None]
     column = jnp.arange(config.width, dtype=jnp.int32)[None, :]
@@ -118,7 +118,8 @@ def atlas_index(
     y = (y_first - sin * row - cos * column) >> _FRACTION_BITS
     # Unsigned, a negative number is larger than any size.
     inside = (x.astype(jnp.uint32) < columns) & (y.astype(jnp.uint32) < rows)
-    return jnp.where(inside, (route.town * rows + y) * columns + x, 0), inside
+    start = road_map.picture_start[route.town]
+    return jnp.where(inside, start + y * columns.astype(jnp.int32) + x, 0), inside
 
 
 def _fixed_point(number: jax.Array) -> jax.Array:

@@ -14,7 +14,7 @@ from flax import struct
 
 from carljax.sim import geometry, traffic
 from carljax.sim.right_of_way import BRAKING, FAR, planned_lane
-from carljax.sim.road_map import RoadMap, pose_at, row_at
+from carljax.sim.road_map import RoadMap, grid_cell, pose_at, row_at
 from carljax.sim.route import Route
 from carljax.sim.spawn import END_CLEARANCE
 from carljax.sim.types import Agents, EgoState
@@ -187,9 +187,8 @@ def _of_cell(
     ego: EgoState, town: jax.Array, road_map: RoadMap, key: jax.Array, cell_size: float
 ) -> Place:
     """One of the places listed for the ego's grid cell."""
-    _, rows, columns, candidates = road_map.spawn_lane.shape
-    cell = ((ego.xy - road_map.origin[town]) / cell_size).astype(jnp.int32)
-    column, row = jnp.clip(cell[0], 0, columns - 1), jnp.clip(cell[1], 0, rows - 1)
-    pick = jax.random.randint(key, (), 0, candidates)
-    found = (town, row, column, pick)
+    found = (
+        grid_cell(road_map, town, ego.xy, cell_size),
+        jax.random.randint(key, (), 0, road_map.spawn_lane.shape[1]),
+    )
     return Place(road_map.spawn_lane[found], road_map.spawn_s[found])

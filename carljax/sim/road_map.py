@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
 
 from carljax.sim import geometry
@@ -62,18 +63,23 @@ class RoadMap(struct.PyTreeNode):
       light_cycle: (L,) s, period of the junction's programme.
       light_start: (L,) s, when within it this light turns green.
       light_junction: (L,) int32, running index of its junction, -1 for a light on the open road.
-      layers: (M, H, W) uint8, LAYER_* bits at `PIXELS_PER_METRE`; row = y, column = x.
-      nearest_point: (M, H, W) int32, row in the point table of the nearest driving-lane point, -1
-        beyond 30 m.
+      layers: (X,) uint8, LAYER_* bits at `PIXELS_PER_METRE`: the towns' pictures one after another,
+        each row by row; row = y, column = x.
+      nearest_point: (X,) int32, likewise; row in the point table of the nearest driving-lane point,
+        -1 beyond 30 m.
+      picture_start: (M,) int32, first pixel of each town.
+      picture_size: (M, 2) int32, rows and columns of its picture.
       origin: (M, 2) m, world position of the centre of pixel [0, 0].
-      spawn_lane: (M, Gy, Gx, C) int32, places for traffic to appear when the ego is in that grid
-        cell; -1 pads.
-      spawn_s: (M, Gy, Gx, C) m.
+      spawn_lane: (Y, C) int32, places for traffic to appear when the ego is in that grid cell; -1
+        pads. The towns' grids lie one after another, each row by row.
+      spawn_s: (Y, C) m.
+      grid_start: (M,) int32, first cell of each town.
+      grid_size: (M, 2) int32, rows and columns of its grid, which covers its picture.
       walk_xyz: (Wn, 3) m, nodes of the towns' walk graphs; the last row belongs to none.
       walk_neighbours: (Wn, D) int32, D the most edges from any node; -1 pads.
       walk_yaw: (Wn, D) rad, direction of each edge.
       walk_kind: (Wn, D) int32, WALK_* of each edge.
-      spawn_walk: (M, Gy, Gx, C) int32, nodes for pedestrians to appear at, likewise.
+      spawn_walk: (Y, C) int32, nodes for pedestrians to appear at, likewise.
     """
 
     lane_start: jax.Array
@@ -109,9 +115,13 @@ class RoadMap(struct.PyTreeNode):
     light_junction: jax.Array
     layers: jax.Array
     nearest_point: jax.Array
+    picture_start: jax.Array
+    picture_size: jax.Array
     origin: jax.Array
     spawn_lane: jax.Array
     spawn_s: jax.Array
+    grid_start: jax.Array
+    grid_size: jax.Array
     walk_xyz: jax.Array
     walk_neighbours: jax.Array
     walk_yaw: jax.Array
@@ -145,24 +155,54 @@ class LaneQuery(struct.PyTreeNode):
 
 
 def pixel(road_map: RoadMap, town: jax.Array, xy: jax.Array) -> jax.Array:
-    """Flat index into the atlases, () int32; -1 outside the town's picture.
+    """Index into the atlases, () int32; -1 outside the town's picture.
 
     Args:
       road_map: the map.
       town: () int32.
       xy: (..., 2) m; the result has its leading shape.
     """
-    _, height, width = road_map.layers.shape
+    height, width = road_map.picture_size[town]
     at = jnp.round((xy - road_map.origin[town]) * PIXELS_PER_METRE).astype(jnp.int32)
     column, row = at[..., 0], at[..., 1]
     inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
-    return jnp.where(inside, (town * height + row) * width + column, -1)
+    return jnp.where(inside, road_map.picture_start[town] + row * width + column, -1)
+
+
+def grid_cell(road_map: RoadMap, town: jax.Array, xy: jax.Array, cell_size: float) -> jax.Array:
+    """Row of the spawn tables, () int32, of the grid cell around a place, or of the nearest one.
+
+    Args:
+      road_map: the map.
+      town: () int32.
+      xy: (2,) m.
+      cell_size: m, side of a cell.
+    """
+    rows, columns = road_map.grid_size[town]
+    at = ((xy - road_map.origin[town]) / cell_size).astype(jnp.int32)
+    column, row = jnp.clip(at[0], 0, columns - 1), jnp.clip(at[1], 0, rows - 1)
+    return road_map.grid_start[town] + row * columns + column
+
+
+def picture(road_map: RoadMap, town: int, atlas: jax.Array | np.ndarray) -> np.ndarray:
+    """One town's part of an atlas, on the host.
+
+    Args:
+      road_map: the map.
+      town: its index.
+      atlas: (X,) one value for each pixel of all towns.
+
+    Returns:
+      (rows, columns) of the town's picture.
+    """
+    start, (rows, columns) = road_map.picture_start[town], np.asarray(road_map.picture_size[town])
+    return np.asarray(atlas)[int(start) :][: rows * columns].reshape(rows, columns)
 
 
 def layer_bits(road_map: RoadMap, town: jax.Array, xy: jax.Array) -> jax.Array:
     """LAYER_* bits under each place, uint8 of xy's leading shape; 0 outside the picture."""
     index = pixel(road_map, town, xy)
-    bits = road_map.layers.reshape(-1)[jnp.maximum(index, 0)]
+    bits = road_map.layers[jnp.maximum(index, 0)]
     return jnp.where(index >= 0, bits, jnp.uint8(0))
 
 
@@ -178,7 +218,7 @@ def nearest_lane(road_map: RoadMap, town: jax.Array, xy: jax.Array) -> LaneQuery
       The query; beyond 30 m of any lane `lane` is -1 and `lateral` is 30 m.
     """
     index = pixel(road_map, town, xy)
-    point = road_map.nearest_point.reshape(-1)[jnp.maximum(index, 0)]
+    point = road_map.nearest_point[jnp.maximum(index, 0)]
     found = (index >= 0) & (point >= 0)
     point = jnp.maximum(point, 0)
     yaw = road_map.point_yaw[point]

@@ -127,21 +127,35 @@ def _turn_signals(town: Town) -> np.ndarray:
 
 
 def _atlases(towns: Sequence[Town], seed: int) -> dict[str, np.ndarray]:
-    """Pixel atlases and respawn tables, all towns padded to the largest."""
-    frames = [atlas.frame(t.network) for t in towns]
-    shape = (max(f[1][0] for f in frames), max(f[1][1] for f in frames))
-    extent = (shape[1] / PIXELS_PER_METRE, shape[0] / PIXELS_PER_METRE)
-    names = ("layers", "nearest_point", "origin", "spawn_lane", "spawn_s", "spawn_walk")
-    out: dict[str, list[np.ndarray]] = {name: [] for name in names}
-    for town, first, (origin, _) in zip(towns, offsets(towns), frames, strict=True):
+    """Pixel atlases and respawn tables, town after town."""
+    names = ("layers", "nearest_point", "spawn_lane", "spawn_s", "spawn_walk")
+    rows: dict[str, list[np.ndarray]] = {name: [] for name in names}
+    origins, pictures, grids = [], [], []
+    for town, first in zip(towns, offsets(towns), strict=True):
         table = town.lanes
+        origin, shape = atlas.frame(town.network)
+        extent = (shape[1] / PIXELS_PER_METRE, shape[0] / PIXELS_PER_METRE)
         nearest = atlas.nearest_point(table.point_xyz[:, :2], origin, shape)
         lane, s = spawn.respawn_table(spawn.places(table), origin, extent, seed)
         walk = walk_graph.respawn_table(town.walks, origin, extent, seed)
-        out["layers"].append(atlas.layers(town.network, origin, shape))
-        out["nearest_point"].append(_shift(np.asarray(nearest), first.point))
-        out["origin"].append(origin)
-        out["spawn_lane"].append(_shift(lane, first.lane))
-        out["spawn_s"].append(s)
-        out["spawn_walk"].append(_shift(walk, first.walk))
-    return {name: np.stack(values) for name, values in out.items()}
+        rows["layers"].append(atlas.layers(town.network, origin, shape).reshape(-1))
+        rows["nearest_point"].append(_shift(nearest, first.point).reshape(-1))
+        rows["spawn_lane"].append(_shift(lane, first.lane).reshape(-1, lane.shape[-1]))
+        rows["spawn_s"].append(s.reshape(-1, s.shape[-1]))
+        rows["spawn_walk"].append(_shift(walk, first.walk).reshape(-1, walk.shape[-1]))
+        origins.append(origin)
+        pictures.append(shape)
+        grids.append(lane.shape[:2])
+    out = {name: np.concatenate(values) for name, values in rows.items()}
+    return out | {
+        "origin": np.stack(origins),
+        "picture_start": _starts(pictures),
+        "picture_size": np.array(pictures),
+        "grid_start": _starts(grids),
+        "grid_size": np.array(grids),
+    }
+
+
+def _starts(sizes: Sequence[tuple[int, ...]]) -> np.ndarray:
+    """(M,) where each town begins among tables of rows times columns."""
+    return np.cumsum([0, *(rows * columns for rows, columns in sizes[:-1])])

@@ -82,8 +82,18 @@ def road_map() -> RoadMap:
     origin, shape = atlas.frame(net)
     layers = np.stack([np.zeros(shape, np.uint8), atlas.layers(net, origin, shape)])
     rest = {field.name: jnp.zeros(0) for field in dataclasses.fields(RoadMap)}
-    rest |= {"layers": jnp.asarray(layers), "origin": jnp.asarray([origin, origin], jnp.float32)}
-    return RoadMap(**rest)
+    return with_pictures(RoadMap(**rest), layers, np.array([origin, origin]))
+
+
+def with_pictures(road_map: RoadMap, layers: np.ndarray, origin: np.ndarray) -> RoadMap:
+    """A map with other pictures: layers (M, H, W) uint8, origin (M, 2) m."""
+    towns = range(len(layers))
+    return road_map.replace(
+        layers=jnp.asarray(layers.reshape(-1)),
+        picture_start=jnp.asarray([town * layers[0].size for town in towns], jnp.int32),
+        picture_size=jnp.asarray([layers[0].shape for _ in towns], jnp.int32),
+        origin=jnp.asarray(origin, jnp.float32),
+    )
 
 
 def ego_at(x: float, y: float, yaw: float = 0.0, **rest: float) -> EgoState:

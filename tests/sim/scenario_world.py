@@ -134,7 +134,7 @@ def _drive(env, driver, speed, seed, num_steps):
 
         return jax.lax.scan(step, _begin(env, episode, key, speed), None, length=num_steps)[1]
 
-    num = env.bank.num_episodes
+    num = len(speed)
     keys = jax.random.split(jax.random.key(seed), num)
     return jax.vmap(one)(jnp.arange(num), keys, speed)
 
@@ -153,7 +153,7 @@ def drive(env, driver=PASSIVE, speed=None, seed=0, num_steps=500) -> Drive:
       num_steps: of 0.1 s.
     """
     speed = limits(env) if speed is None else speed
-    speed = jnp.broadcast_to(jnp.asarray(speed, jnp.float32), (env.bank.num_episodes,))
+    speed = jnp.broadcast_to(jnp.asarray(speed, jnp.float32), (int(env.bank.num_episodes),))
     found = _drive_jit(env, jnp.int32(driver), speed, seed, num_steps=num_steps)
     sim, hits = jax.tree.map(np.asarray, found)
     s = np.take_along_axis(np.asarray(env.bank.routes.s), sim.route_idx, axis=1)

@@ -14,6 +14,7 @@ from crossing_world import agents_of, ego_at, road_map, route_east
 
 from carljax.sim import raster_roach, raster_spans
 from carljax.sim.raster_canvas import RasterConfig
+from carljax.sim.road_map import picture
 from carljax.sim.types import (
     KIND_NONE,
     KIND_PEDESTRIAN,
@@ -163,7 +164,7 @@ def test_random_scenes_match_the_oracle(world, config, seed):
     kinds = [STOP_LIGHT, STOP_SIGN, STOP_LIGHT, STOP_SIGN]
     route = stops(kinds, [72 + 8 * seed, 76, 84, 90])
     image = draw(world, ego, moments, route, 66, config)
-    layers, origin = np.asarray(world.layers[1]), np.asarray(world.origin[1])
+    layers, origin = picture(world, 1, world.layers), np.asarray(world.origin[1])
     expected = kinds_oracle.roach(ego, moments, layers, origin, route, 66, config)
     assert (image == expected).all(axis=-1).mean() > 0.99
     for channel, name in enumerate(raster_roach.CHANNELS):

@@ -12,10 +12,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import raster_oracle
-from crossing_world import agents_of, ego_at, road_map, route_east
+from crossing_world import agents_of, ego_at, road_map, route_east, with_pictures
 
 from carljax.sim import raster_canvas, raster_users, rasterizer
 from carljax.sim.raster_canvas import RasterConfig
+from carljax.sim.road_map import picture
 from carljax.sim.types import (
     DOOR_FRONT_LEFT,
     DOOR_REAR_RIGHT,
@@ -366,7 +367,7 @@ def test_random_scenes_match_the_oracle(world, config, seed):
     config = dataclasses.replace(config, route_everywhere=seed == 1)
     ego, agents, route, signals = random_scene(seed)
     image = draw(world, ego, agents, route, idx=70, config=config, **signals)
-    layers, origin = np.asarray(world.layers[1]), np.asarray(world.origin[1])
+    layers, origin = picture(world, 1, world.layers), np.asarray(world.origin[1])
     expected = raster_oracle.render(
         ego, agents, layers, origin, route, 70, signals["colour"], signals["left"],
         signals["satisfied"], config,
@@ -389,12 +390,13 @@ def quarter_turn(world, ego, agents, route, shift):
         return jnp.stack([-xy[..., 1], xy[..., 0]], axis=-1) + jnp.asarray(shift)
 
     quarter = jnp.float32(math.pi / 2)
-    layers = jnp.swapaxes(world.layers[:, ::-1], 1, 2)  # row' = column, column' = last - row
+    layers = np.stack([picture(world, number, world.layers) for number in range(2)])
     # Column 0 of the turned picture was the last row.
-    height = (world.layers.shape[1] - 1) / 2
+    height = (layers.shape[1] - 1) / 2
     origin = turn(world.origin + jnp.array([0.0, height]))
+    layers = np.swapaxes(layers[:, ::-1], 1, 2)  # row' = column, column' = last - row
     return (
-        world.replace(layers=layers, origin=origin),
+        with_pictures(world, layers, origin),
         ego.replace(xy=turn(ego.xy), yaw=ego.yaw + quarter),
         agents.replace(xy=turn(agents.xy), yaw=agents.yaw + quarter),
         route.replace(

@@ -7,7 +7,7 @@ import pytest
 from small_world import arc, crossing, link, network, road, straight
 
 from carljax.sim import road_map, road_map_builder, spawn, town
-from carljax.sim.road_map import LAYER_JUNCTION, LAYER_ROAD, PIXELS_PER_METRE
+from carljax.sim.road_map import LAYER_JUNCTION, LAYER_ROAD, PIXELS_PER_METRE, picture
 from carljax.sim.types import STOP_LIGHT
 
 REACH = 30.0  # m, documented reach of the nearest-lane query
@@ -24,7 +24,7 @@ def grid(bundled):
 def random_points(rows, num, on_centres):
     """Points in the town's picture, and around it where they need not be pixel centres."""
     rng = np.random.default_rng(0)
-    height, width = rows.layers.shape[1:]
+    height, width = rows.picture_size[0]
     origin = np.asarray(rows.origin[0], float)
     if on_centres:
         return origin + rng.integers(0, [width, height], (num, 2)) / PIXELS_PER_METRE
@@ -41,7 +41,7 @@ def test_nearest_lane_is_that_of_brute_force(grid, on_centres):
     distance = np.hypot(*(xy[:, None] - table.point_xyz[None, :, :2]).transpose(2, 0, 1))
     # Off the pixel centres the answer is that of the centre, up to 0.354 m away: 0.71 m farther.
     slack = 1e-3 if on_centres else 0.71
-    height, width = rows.layers.shape[1:]
+    height, width = rows.picture_size[0]
     pixel = (xy - np.asarray(rows.origin[0])) * PIXELS_PER_METRE
     outside = ((pixel < -0.5) | (pixel > np.array([width, height]) - 0.5)).any(axis=1)
     num_found = 0
@@ -73,7 +73,7 @@ def test_nearest_lane_is_that_of_brute_force(grid, on_centres):
 
 def test_outside_the_picture_there_is_nothing(grid):
     rows = grid[1]
-    height, width = rows.layers.shape[1:]
+    height, width = (int(size) for size in rows.picture_size[0])
     low = np.asarray(rows.origin[0])
     high = low + np.array([width - 1, height - 1]) / PIXELS_PER_METRE
     middle = (low + high) / 2
@@ -211,28 +211,47 @@ def test_names_of_junctions_are_not_shared_between_towns(pair):
 
 
 @pytest.mark.parametrize("number", [0, 1])
-def test_pictures_of_towns_together_are_padded(pair, number):
+def test_pictures_and_grids_of_towns_lie_one_after_another(pair, number):
     _, alone, together = pair
     mine = alone[number]
-    height, width = mine.layers.shape[1:]
     np.testing.assert_array_equal(together.origin[number], mine.origin[0])
-    np.testing.assert_array_equal(together.layers[number, :height, :width], mine.layers[0])
-    assert not np.asarray(together.layers[number, height:]).any()
-    assert not np.asarray(together.layers[number, :, width:]).any()
-    shift = sum(len(m.point_lane) for m in alone[:number])
-    nearest = np.asarray(mine.nearest_point[0])
+    assert len(together.layers) == sum(len(m.layers) for m in alone)
+    assert picture(mine, 0, mine.layers).shape == tuple(mine.picture_size[0])
     np.testing.assert_array_equal(
-        together.nearest_point[number, :height, :width],
+        picture(together, number, together.layers), picture(mine, 0, mine.layers)
+    )
+    shift = sum(len(m.point_lane) for m in alone[:number])
+    nearest = picture(mine, 0, mine.nearest_point)
+    np.testing.assert_array_equal(
+        picture(together, number, together.nearest_point),
         np.where(nearest >= 0, nearest + shift, nearest),
     )
-    rows, columns = mine.spawn_lane.shape[1:3]
+    assert together.grid_start[number] == sum(len(m.spawn_lane) for m in alone[:number])
+    np.testing.assert_array_equal(together.grid_size[number], mine.grid_size[0])
+    assert mine.grid_size[0].prod() == len(mine.spawn_lane)
+    rows = int(together.grid_start[number]) + np.arange(len(mine.spawn_lane))
     shift = sum(len(m.lane_length) for m in alone[:number])
-    lane = np.asarray(mine.spawn_lane[0])
+    lane = np.asarray(mine.spawn_lane)
     assert (lane >= 0).any()
     np.testing.assert_array_equal(
-        together.spawn_lane[number, :rows, :columns], np.where(lane >= 0, lane + shift, lane)
+        together.spawn_lane[rows], np.where(lane >= 0, lane + shift, lane)
     )
-    np.testing.assert_array_equal(together.spawn_s[number, :rows, :columns], mine.spawn_s[0])
+    np.testing.assert_array_equal(together.spawn_s[rows], mine.spawn_s)
+
+
+def test_the_cell_of_a_place_is_the_one_around_it_or_the_nearest(pair):
+    _, _, together = pair
+    for number in range(2):
+        rows, columns = (int(size) for size in together.grid_size[number])
+        start, origin = int(together.grid_start[number]), together.origin[number]
+        for row, column in ((0, 0), (1, 2), (rows - 1, columns - 1)):
+            middle = origin + 20.0 * (jnp.array([column, row]) + 0.5)
+            cell = road_map.grid_cell(together, jnp.int32(number), middle, 20.0)
+            assert cell == start + row * columns + column
+        far = road_map.grid_cell(together, jnp.int32(number), origin - 500.0, 20.0)
+        assert far == start
+        far = road_map.grid_cell(together, jnp.int32(number), origin + 1e4, 20.0)
+        assert far == start + rows * columns - 1
 
 
 def test_look_ups_stay_in_their_town(pair):

@@ -12,7 +12,7 @@ from carljax.reward import reward
 from carljax.reward.config import RewardConfig
 from carljax.sim import geometry, lights, route, situation
 from carljax.sim.env import metric_names
-from carljax.sim.road_map import LAYER_PARKING, LAYER_ROAD, PIXELS_PER_METRE
+from carljax.sim.road_map import LAYER_PARKING, LAYER_ROAD, PIXELS_PER_METRE, picture
 from carljax.sim.types import KIND_VEHICLE
 
 SIZE = (4.892, 1.836)
@@ -93,14 +93,15 @@ def test_gaps_along_the_route_are_those_of_its_polyline(small_env, places):
 
 def test_corners_and_others_are_looked_up_in_the_town_s_picture(small_env, places):
     road_map = small_env.bank.road_map
-    layers, origin = np.asarray(road_map.layers), np.asarray(road_map.origin, float)
+    layers = [picture(road_map, town, road_map.layers) for town in range(2)]
+    origin = np.asarray(road_map.origin, float)
     seen_off = 0
     for episode, _, ego, agents, seen in places:
         town = int(small_env.bank.routes.town[episode])
 
         def bits(xy, town=town):
             column, row = np.round((xy - origin[town]) * PIXELS_PER_METRE).astype(int)
-            return layers[town, row, column]
+            return layers[town][row, column]
 
         c, s = np.cos(float(ego.yaw)), np.sin(float(ego.yaw))
         for k, (x, y) in enumerate([(1, 1), (-1, 1), (-1, -1), (1, -1)]):

@@ -228,5 +228,6 @@ def test_rows_of_two_towns_lie_one_after_another(bundled):
     np.testing.assert_array_equal(neighbours[first:-1, : shape[1]], want)
     assert (neighbours[:first] < first).all()
     spawns = np.asarray(rows.spawn_walk)
-    assert spawns[0].max() < first <= spawns[1][spawns[1] >= 0].min()
+    one, two = np.split(spawns, [int(rows.grid_start[1])])
+    assert one.max() < first <= two[two >= 0].min()
     assert spawns.max() < len(xyz) - 1
