@@ -5,17 +5,15 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import jax
 from jax.sharding import Mesh
 
-from carljax import machine, memory, route_bank
+from carljax import machine, route_bank
 from carljax.config import ConfigError, TrainConfig
-from carljax.memory import MemoryEstimate
-from carljax.ppo import trainer
+from carljax.ppo import obs_storage, trainer
 from carljax.ppo.networks import ActorCritic
-from carljax.ppo.rollout import rollout
+from carljax.ppo.obs_storage import STORE, ObsStorage
 from carljax.ppo.types import TrainState
 from carljax.route_bank import BankError
 from carljax.sim import bank_padding, episodes, journey, town, towns
@@ -34,6 +32,7 @@ class Setup:
       env: with the training routes, on every device.
       network: actor and critic.
       mesh: the devices.
+      storage: how the observations of a batch are kept.
     """
 
     config: TrainConfig
@@ -41,6 +40,7 @@ class Setup:
     env: DrivingEnv
     network: ActorCritic
     mesh: Mesh
+    storage: ObsStorage = STORE
 
 
 def setup(config: TrainConfig) -> Setup:
@@ -70,7 +70,28 @@ def setup(config: TrainConfig) -> Setup:
     else:
         training = environment(config, loaded, run.num_routes, seed)
     training = trainer.replicate(training, mesh)
-    return Setup(config, loaded, training, ActorCritic(config.network), mesh)
+    network = ActorCritic(config.network)
+    return Setup(config, loaded, training, network, mesh, obs_storage_on(mesh, config))
+
+
+def obs_storage_on(mesh: Mesh, config: TrainConfig) -> ObsStorage:
+    """Returns the way to keep observations that is asked for, or chooses it by their size."""
+    asked = config.run.obs_storage
+    if asked != "auto":
+        return obs_storage.STORAGES[asked]
+    raster, channels = config.env.raster, len(config.env.channels)
+    return obs_storage.choose(
+        (raster.height, raster.width, channels),
+        config.env.levels,
+        config.ppo.batch_size // mesh.size,
+        memory_of_device(mesh),
+    )
+
+
+def memory_of_device(mesh: Mesh) -> int:
+    """Returns the bytes that a device may use; those on the CPU share their host's."""
+    available = machine.device_memory()
+    return available // mesh.local_mesh.size if jax.default_backend() == "cpu" else available
 
 
 def load_towns(maps: Sequence[Path]) -> list[Town]:
@@ -167,40 +188,3 @@ def initial_state(made: Setup) -> TrainState:
     """Makes the training state before the first update."""
     key = jax.random.key(made.config.run.seed)
     return trainer.init(key, made.env, made.network, made.config.ppo, made.mesh)
-
-
-def estimate_memory(made: Setup) -> tuple[int, MemoryEstimate]:
-    """Works out the size of the network and the memory of a run, allocating nothing.
-
-    Args:
-      made: see `setup`.
-
-    Returns:
-      Number of parameters, and the memory on one device.
-    """
-    ppo, num_devices = made.config.ppo, made.mesh.size
-
-    def shapes(env: DrivingEnv) -> tuple[TrainState, Any]:
-        state = initial_state(dataclasses.replace(made, env=env))
-        local = jax.tree.map(lambda x: x[: x.shape[0] // num_devices], state.env_state)
-        keys = jax.random.split(state.key, ppo.num_envs // num_devices)
-        batch = rollout(env, made.network, state.params, local, keys, ppo.num_steps)[1]
-        return state.replace(env_state=local), batch
-
-    state, batch = jax.eval_shape(shapes, made.env)
-    at_once = ppo.micro_batch_size or ppo.minibatch_size // num_devices
-    obs = jax.tree.map(lambda x: jax.ShapeDtypeStruct((at_once, *x.shape[2:]), x.dtype), batch.obs)
-    parts = {
-        "towns and routes": memory.tree_bytes(made.env),
-        "parameters, gradients, optimiser": 2 * memory.tree_bytes(state.params)
-        + memory.tree_bytes(state.opt_state),
-        "environment states": memory.tree_bytes(state.env_state),
-        "rollout": memory.tree_bytes(batch),
-        f"activations of {at_once} samples (at most)": memory.activation_bytes(
-            made.network, state.params, obs
-        ),
-    }
-    available = machine.device_memory()
-    if jax.default_backend() == "cpu":
-        available //= made.mesh.local_mesh.size
-    return memory.count(state.params), MemoryEstimate(parts, available)

@@ -63,6 +63,10 @@ class RunConfig:
     num_devices: int | None = None
     """Accelerators or CPU devices to share the environments among, of all processes together and
     equally many of each; all by default."""
+    obs_storage: Literal["auto", "store", "pack", "rerender"] = "auto"
+    """How a batch's images are kept until the update has used them: as they are, in few bits, or
+    drawn again from the simulator's states. The result is the same. auto: the first of these
+    whose images take no more than half of a device's memory."""
     log_every: int = 1
     """Updates between two lines of metrics.jsonl."""
     checkpoint_every: int = 50

@@ -40,7 +40,7 @@ def learn(made: Setup, state: TrainState, path: Path, console: Console) -> Train
     """
     run, ppo = made.config.run, made.config.ppo
     start = int(state.update)
-    train_step = trainer.make_train_step(made.network, ppo, made.mesh)
+    train_step = trainer.make_train_step(made.network, ppo, made.mesh, made.storage)
     before_start = [line for line in metrics_log.read(path) if line["update"] <= start]
     window = WindowMean(run.best_window, [line.get(SCORE) for line in before_start])
     with (

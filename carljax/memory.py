@@ -8,6 +8,12 @@ from typing import Any
 
 import jax
 
+from carljax import build
+from carljax.build import Setup
+from carljax.ppo.rollout import rollout
+from carljax.ppo.types import TrainState, Transition
+from carljax.sim.env import DrivingEnv
+
 
 @dataclasses.dataclass(frozen=True)
 class MemoryEstimate:
@@ -30,6 +36,49 @@ class MemoryEstimate:
     def fits(self) -> bool:
         """Whether the parts fit into what is available."""
         return self.total <= self.available
+
+
+def estimate(made: Setup) -> tuple[int, MemoryEstimate]:
+    """Works out the size of the network and the memory of a run, allocating nothing.
+
+    Args:
+      made: see `build.setup`.
+
+    Returns:
+      Number of parameters, and the memory on one device.
+    """
+    state, batch = jax.eval_shape(lambda env: _first_batch(env, made), made.env)
+    ppo, num_devices = made.config.ppo, made.mesh.size
+    at_once = ppo.micro_batch_size or ppo.minibatch_size // num_devices
+    obs = jax.tree.map(
+        lambda x: jax.ShapeDtypeStruct((at_once, *x.shape[1:]), x.dtype), state.env_state.obs
+    )
+    parts = {
+        "towns and routes": tree_bytes(made.env),
+        "parameters, gradients, optimiser": 2 * tree_bytes(state.params)
+        + tree_bytes(state.opt_state),
+        "environment states": tree_bytes(state.env_state),
+        f"batch of {ppo.batch_size // num_devices:,} samples ({made.storage.name})": tree_bytes(
+            batch
+        ),
+        f"activations of {at_once} samples (at most)": activation_bytes(
+            made.network, state.params, obs
+        ),
+    }
+    available = build.memory_of_device(num_devices)
+    return count(state.params), MemoryEstimate(parts, available)
+
+
+def _first_batch(env: DrivingEnv, made: Setup) -> tuple[TrainState, Transition]:
+    """A training state with the environments of one device, and what they collect."""
+    ppo, num_devices = made.config.ppo, made.mesh.size
+    state = build.initial_state(dataclasses.replace(made, env=env))
+    local = jax.tree.map(lambda x: x[: x.shape[0] // num_devices], state.env_state)
+    keys = jax.random.split(state.key, ppo.num_envs // num_devices)
+    batch = rollout(
+        env, made.network, state.params, local, keys, ppo.num_steps, storage=made.storage
+    )[1]
+    return state.replace(env_state=local), batch
 
 
 def tree_bytes(tree: Any) -> int:

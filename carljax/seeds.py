@@ -19,7 +19,7 @@ import jax
 import numpy as np
 from rich.console import Console
 
-from carljax import build, checkpoint, learn, metrics_log, run_dir
+from carljax import build, checkpoint, learn, memory, metrics_log, run_dir
 from carljax.build import Setup
 from carljax.config import TrainConfig
 from carljax.metrics_log import MetricsLog, Report, WindowMean
@@ -32,7 +32,7 @@ MEMORY_FRAC = 0.8  # of a device's memory that several seeds may take
 
 def num_at_once(made: Setup) -> int:
     """How many seeds fit into the memory of one device, at least 1."""
-    _, estimate = build.estimate_memory(made)
+    _, estimate = memory.estimate(made)
     shared = estimate.parts["towns and routes"]
     own = max(estimate.total - shared, 1)
     return max(int((MEMORY_FRAC * estimate.available - shared) // own), 1)
@@ -107,7 +107,7 @@ def _learn(
     """The loop around the train step of all seeds; see `learn.learn` for that of one."""
     run, ppo = made.config.run, made.config.ppo
     start = int(state.update[0])
-    train_step = trainer.make_seeds_step(made.network, ppo, made.mesh)
+    train_step = trainer.make_seeds_step(made.network, ppo, made.mesh, made.storage)
     with ExitStack() as stack:
         logs = [stack.enter_context(MetricsLog(folder, start)) for folder in folders]
         report = stack.enter_context(Report(console, start, ppo.num_updates))

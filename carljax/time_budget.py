@@ -26,7 +26,7 @@ def samples_per_second(config: TrainConfig) -> float:
     """
     made = build.setup(config)
     first = build.initial_state(made)
-    train_step = trainer.make_train_step(made.network, config.ppo, made.mesh)
+    train_step = trainer.make_train_step(made.network, config.ppo, made.mesh, made.storage)
 
     def follow(result: Any) -> tuple:
         return made.env, first if result is None else result[0]

@@ -198,7 +198,7 @@ def describe(made: Setup, console: Console) -> None:
         values = ", ".join(f"{field}={value}" for field, value in part.items())
         console.print(f"[bold]{name}[/bold]  {values}", highlight=False)
     names = ", ".join(town.network.name for town in made.towns)
-    num_parameters, estimate = build.estimate_memory(made)
+    num_parameters, estimate = memory.estimate(made)
     ppo = made.config.ppo
     devices = made.mesh.devices.flat
     console.print(f"towns       {names}")

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 
 from carljax.ppo import beta, hints
 from carljax.ppo.networks import ActorCritic, forward
+from carljax.ppo.obs_storage import STORE, ObsStorage
 from carljax.ppo.types import Transition
 from carljax.sim import autoreset
 from carljax.sim.autoreset import Env
@@ -26,6 +27,7 @@ def rollout(
     num_steps: int,
     keeps_policy: bool = False,
     keeps_hints: bool = False,
+    storage: ObsStorage = STORE,
 ) -> tuple[State, Transition, jax.Array, dict[str, jax.Array]]:
     """Drives all environments for a number of steps.
 
@@ -39,6 +41,7 @@ def rollout(
       num_steps: T.
       keeps_policy: fill in `Transition.policy`.
       keeps_hints: fill in `Transition.hint`.
+      storage: how `Transition.obs` is kept.
 
     Returns:
       (B,) states after the last step; (T, B) transitions; (B,) value of the last states; {name: ()}
@@ -53,7 +56,7 @@ def rollout(
         autostep = jax.vmap(autoreset.step, in_axes=(None, 0, 0, 0))
         next_state = autostep(env, env_state, command, keys_t[:, 1])
         transition = Transition(
-            obs=env_state.obs,
+            obs=jax.vmap(storage.keep, in_axes=(None, 0))(env, env_state),
             action=action,
             log_prob=beta.log_prob(action, alpha, beta_),
             value=value,

@@ -20,6 +20,7 @@ from carljax.ppo.config import PPOConfig
 from carljax.ppo.gae import gae
 from carljax.ppo.kl_patience import KLPatience
 from carljax.ppo.networks import ActorCritic
+from carljax.ppo.obs_storage import STORE, ObsStorage
 from carljax.ppo.rollout import mean_metrics, rollout
 from carljax.ppo.types import Minibatch, TrainState, Transition
 from carljax.ppo.update import (
@@ -147,13 +148,16 @@ def init(
     return jax.jit(build, out_shardings=shardings(mesh))(key, env)
 
 
-def make_train_step(network: ActorCritic, config: PPOConfig, mesh: Mesh) -> TrainStep:
+def make_train_step(
+    network: ActorCritic, config: PPOConfig, mesh: Mesh, storage: ObsStorage = STORE
+) -> TrainStep:
     """Compiles one PPO iteration: rollout, advantages, epochs x minibatches.
 
     Args:
       network: actor and critic.
       config: see `PPOConfig`.
       mesh: see `make_mesh`.
+      storage: how observations are kept from rollout to update; the result is the same.
 
     Returns:
       train_step(env, train_state) -> (train_state, {name: () float32}). It consumes (donates) its
@@ -168,17 +172,20 @@ def make_train_step(network: ActorCritic, config: PPOConfig, mesh: Mesh) -> Trai
     # than that of the first state, and the second call would compile once more.
     out = (shardings(mesh), NamedSharding(mesh, PartitionSpec()))
     options = compiler_options(mesh.devices.flat[0].platform)
-    step = _sharded_step(network, config, mesh)
+    step = _sharded_step(network, config, mesh, storage)
     return jax.jit(step, donate_argnums=1, out_shardings=out, compiler_options=options)
 
 
-def make_seeds_step(network: ActorCritic, config: PPOConfig, mesh: Mesh) -> TrainStep:
+def make_seeds_step(
+    network: ActorCritic, config: PPOConfig, mesh: Mesh, storage: ObsStorage = STORE
+) -> TrainStep:
     """Compiles one PPO iteration of several independent runs, which share the environment's bank.
 
     Args:
       network: actor and critic.
       config: see `PPOConfig`.
       mesh: see `make_mesh`.
+      storage: as in `make_train_step`.
 
     Returns:
       As `make_train_step`, with an axis of runs in front of the training state (see `stack`) and of
@@ -190,7 +197,7 @@ def make_seeds_step(network: ActorCritic, config: PPOConfig, mesh: Mesh) -> Trai
     config.validate(mesh.size)
     out = (_with_runs(shardings(mesh)), NamedSharding(mesh, PartitionSpec()))
     options = compiler_options(mesh.devices.flat[0].platform)
-    step = jax.vmap(_sharded_step(network, config, mesh), in_axes=(None, 0))
+    step = jax.vmap(_sharded_step(network, config, mesh, storage), in_axes=(None, 0))
     return jax.jit(step, donate_argnums=1, out_shardings=out, compiler_options=options)
 
 
@@ -218,9 +225,11 @@ def _with_runs(places: TrainState) -> TrainState:
     )
 
 
-def _sharded_step(network: ActorCritic, config: PPOConfig, mesh: Mesh) -> TrainStep:
+def _sharded_step(
+    network: ActorCritic, config: PPOConfig, mesh: Mesh, storage: ObsStorage
+) -> TrainStep:
     """One PPO iteration over all devices, not yet compiled."""
-    local = functools.partial(_local_step, network=network, config=config)
+    local = functools.partial(_local_step, network=network, config=config, storage=storage)
     # Without check_vma a simulator may start its inner loops from constants, which vary over no
     # device. Nothing here rests on it: no collective is differentiated, and a test compares 1 and
     # 4 devices.
@@ -241,7 +250,11 @@ def _local_start(env: Env, key: jax.Array, num_envs: int) -> State:
 
 
 def _local_step(
-    env: Env, train_state: TrainState, network: ActorCritic, config: PPOConfig
+    env: Env,
+    train_state: TrainState,
+    network: ActorCritic,
+    config: PPOConfig,
+    storage: ObsStorage,
 ) -> tuple[TrainState, dict[str, jax.Array]]:
     """One PPO iteration on this device's environments."""
     device = jax.lax.axis_index(AXIS)
@@ -259,6 +272,7 @@ def _local_step(
         config.num_steps,
         keeps_policy=config.kl_patience is not None,
         keeps_hints=config.hint_coef > 0,
+        storage=storage,
     )
     samples = make_samples(batch, last_value, config)
     rate = _rate(train_state, config)
@@ -270,6 +284,7 @@ def _local_step(
         rate,
         network,
         config,
+        recall=lambda kept: jax.vmap(storage.recall, in_axes=(None, 0))(env, kept),
     )
     metrics = {f"ppo/{name}": value for name, value in losses.items()}
     metrics["ppo/explained_variance"] = explained_variance(samples)

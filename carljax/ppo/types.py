@@ -8,14 +8,14 @@ import jax
 from flax import struct
 
 from carljax.ppo.kl_patience import KLPatience
-from carljax.sim.types import Observation, State
+from carljax.sim.types import State
 
 
 class Transition(struct.PyTreeNode):
     """Steps of a rollout, (T, B) in front.
 
     Attributes:
-      obs: what the policy saw; raster uint8.
+      obs: what the policy saw; raster uint8. In training what is kept of it, see `obs_storage`.
       action: (A,) float32 in (0, 1), the Beta sample.
       log_prob: () of `action`, summed over its dimensions.
       value: () the critic's estimate for `obs`.
@@ -27,7 +27,7 @@ class Transition(struct.PyTreeNode):
       hint: () int8, what an end at this step suggests, see `hints`; None without hints.
     """
 
-    obs: Observation
+    obs: Any
     action: jax.Array
     log_prob: jax.Array
     value: jax.Array
@@ -54,7 +54,7 @@ class Minibatch(struct.PyTreeNode):
       hint: () int8, what is suggested for this step; None without hints.
     """
 
-    obs: Observation
+    obs: Any
     action: jax.Array
     log_prob: jax.Array
     value: jax.Array

@@ -22,8 +22,16 @@ from carljax.ppo.config import PPOConfig
 from carljax.ppo.loss import loss
 from carljax.ppo.networks import ActorCritic
 from carljax.ppo.types import Minibatch, Transition
+from carljax.sim.types import Observation
 
 AXIS = "data"
+
+Recall = Callable[[Any], Observation]  # from what is kept of (M,) observations to these
+
+
+def as_kept(obs: Observation) -> Observation:
+    """Returns observations that are kept as they are."""
+    return obs
 
 
 def make_optimizer(config: PPOConfig) -> optax.GradientTransformation:
@@ -69,6 +77,7 @@ def update(
     rate: jax.Array,
     network: ActorCritic,
     config: PPOConfig,
+    recall: Recall = as_kept,
 ) -> tuple[Any, Any, dict[str, jax.Array]]:
     """Runs all epochs on one batch.
 
@@ -80,6 +89,7 @@ def update(
       rate: () learning rate.
       network: actor and critic.
       config: see `PPOConfig`.
+      recall: makes observations of what the samples keep of them, see `obs_storage`.
 
     Returns:
       Parameters, optimiser state and {name: ()} means over all gradient steps of the loss's metrics
@@ -93,7 +103,7 @@ def update(
         samples: Minibatch, carry: tuple, rows: jax.Array
     ) -> tuple[tuple, dict[str, jax.Array]]:
         params, opt_state = carry
-        grads, metrics = minibatch_gradient(params, samples, rows, network, config)
+        grads, metrics = minibatch_gradient(params, samples, rows, network, config, recall)
         squares = [jnp.sum(jnp.square(grad)) for grad in jax.tree.leaves(grads)]
         metrics["grad_norm"] = jnp.sqrt(sum(squares))
         direction, opt_state = optimizer.update(grads, opt_state)
@@ -128,7 +138,12 @@ def later_advantage(samples: Minibatch, config: PPOConfig) -> jax.Array:
 
 
 def minibatch_gradient(
-    params: Any, samples: Minibatch, rows: jax.Array, network: ActorCritic, config: PPOConfig
+    params: Any,
+    samples: Minibatch,
+    rows: jax.Array,
+    network: ActorCritic,
+    config: PPOConfig,
+    recall: Recall = as_kept,
 ) -> tuple[Any, dict[str, jax.Array]]:
     """Computes the gradient of the loss over one minibatch of all devices.
 
@@ -138,6 +153,7 @@ def minibatch_gradient(
       rows: (M,) int32, those of them that are in the minibatch.
       network: actor and critic.
       config: see `PPOConfig`.
+      recall: see `update`.
 
     Returns:
       Gradient and {name: ()} metrics, the same on every device.
@@ -152,7 +168,7 @@ def minibatch_gradient(
     def piece(rows: jax.Array, weight: jax.Array, advantage: jax.Array) -> tuple[Any, dict]:
         # Rows of the large images are gathered here, a cache-sized piece at a time.
         minibatch = jax.tree.map(lambda x: x[rows], samples)
-        minibatch = minibatch.replace(weight=weight, advantage=advantage)
+        minibatch = minibatch.replace(obs=recall(minibatch.obs), weight=weight, advantage=advantage)
         return jax.grad(loss, has_aux=True)(params, network, minibatch, config)
 
     if config.micro_batch_size is None:

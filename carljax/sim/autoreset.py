@@ -23,6 +23,10 @@ class Env(Protocol):
     action))`. They are apart so that an autoreset chooses the state first and draws only one image.
     """
 
+    @property
+    def levels(self) -> tuple[tuple[int, ...] | None, ...]:
+        """The values other than 0 that each channel of its image takes; None: any."""
+
     def start(self, key: jax.Array) -> State:
         """Returns the first state of an episode, its `obs` still None."""
 

@@ -106,6 +106,11 @@ class EnvConfig:
         """Names of the image's channels."""
         return observation.KINDS[self.observation].channels
 
+    @property
+    def levels(self) -> tuple[tuple[int, ...] | None, ...]:
+        """The values other than 0 that each channel takes; None where it may take any."""
+        return tuple(observation.KINDS[self.observation].levels.get(x) for x in self.channels)
+
     def validate(self) -> None:
         """Checks the image and that no option is for another kind of observation.
 
@@ -144,6 +149,11 @@ class DrivingEnv(struct.PyTreeNode):
     def action_size(self) -> int:
         """Length of an action: steering and longitudinal, each in [-1, 1]."""
         return ACTION_SIZE
+
+    @property
+    def levels(self) -> tuple[tuple[int, ...] | None, ...]:
+        """See `EnvConfig.levels`."""
+        return self.config.levels
 
     def reset(self, key: jax.Array) -> State:
         """Returns the first state of an episode drawn from the bank."""

@@ -45,6 +45,7 @@ class Kind(NamedTuple):
 
     Attributes:
       channels: names of the image's channels.
+      levels: {channel: the values other than 0 that it takes}, for those that take few.
       raster: the size that its authors gave the image.
       observe: (env, sim) to the observation.
       begin: (env, sim) to what the first state of an episode leaves to remember.
@@ -52,6 +53,7 @@ class Kind(NamedTuple):
     """
 
     channels: tuple[str, ...]
+    levels: dict[str, tuple[int, ...]]
     raster: RasterConfig
     observe: Callable[[Any, SimState], Observation]
     begin: Callable[[Any, SimState], Trail | PastMotion | None]
@@ -61,6 +63,7 @@ class Kind(NamedTuple):
 KINDS = {
     "carla": Kind(
         raster_canvas.CHANNELS,
+        raster_canvas.LEVELS,
         RasterConfig(),
         observation_carla.observe,
         lambda env, sim: None,
@@ -68,6 +71,7 @@ KINDS = {
     ),
     "roach": Kind(
         raster_roach.CHANNELS,
+        raster_roach.LEVELS,
         raster_roach.RASTER,
         observation_roach.observe,
         observation_roach.begin,
@@ -75,6 +79,7 @@ KINDS = {
     ),
     "nuplan": Kind(
         raster_nuplan.CHANNELS,
+        raster_nuplan.LEVELS,
         raster_nuplan.RASTER,
         observation_nuplan.observe,
         observation_nuplan.begin,

@@ -30,6 +30,11 @@ CHANNELS = (
     "shoulder",
 )
 NUM_CHANNELS = len(CHANNELS)
+# The values other than 0 of those channels that have few; the others take any.
+LEVELS = {
+    **dict.fromkeys(("road", "route", "stop_sign", "static", "shoulder"), (255,)),
+    "markings": (127, 255),
+}
 ROUTE_AHEAD = 150  # route points. source: the authors' code
 
 # Farther apart and a pixel, whatever its rotation, could slip between samples (a square of side 1

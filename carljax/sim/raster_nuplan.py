@@ -54,6 +54,11 @@ LINES = ("lane_borders", "lights", "stop_lines", "speed_limits")  # the others a
 SPEED_MAX, WALK_SPEED_MAX = 30.0, 4.0  # m/s, of vehicles and limits, of pedestrians
 STATIC_VALUE = 127
 GREEN_VALUE, YELLOW_VALUE, RED_VALUE = 80, 170, 255
+# The values other than 0 of those channels that have few; the others take any.
+LEVELS = {
+    **dict.fromkeys(("drivable", "route", "lane_borders", "stop_lines"), (255,)),
+    "lights": (GREEN_VALUE, YELLOW_VALUE, RED_VALUE),
+}
 SPEED_LINE_S = 1.0  # s
 
 _VEHICLES, _PEDESTRIANS, _EGO = (CHANNELS.index(x) for x in ("vehicles", "pedestrians", "ego"))

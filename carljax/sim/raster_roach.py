@@ -45,6 +45,12 @@ CHANNELS = (
 )
 SOLID_VALUE, BROKEN_VALUE = 255, 120
 GREEN_VALUE, YELLOW_VALUE, RED_VALUE, STOP_VALUE = 80, 170, 255, 255
+# The values other than 0 of each channel.
+LEVELS = {
+    **dict.fromkeys(CHANNELS, (255,)),
+    "markings": (BROKEN_VALUE, SOLID_VALUE),
+    **{f"signals {when}": (GREEN_VALUE, YELLOW_VALUE, RED_VALUE) for when in SECONDS},
+}
 ROUTE_AHEAD = 80  # route points of about 1 m
 ROUTE_WIDTH = 3.2  # m: 16 px at 5 px/m
 STOP_LINE_THICKNESS = 1.2  # m: 6 px at 5 px/m

@@ -31,6 +31,11 @@ class ToyEnv:
     starts: jax.Array
     limit: int = struct.field(pytree_node=False, default=32)
 
+    @property
+    def levels(self):
+        """Both channels are masks."""
+        return ((255,), (255,))
+
     def start(self, key: jax.Array) -> State:
         """Draws a position."""
         idx = jax.random.randint(key, (), 0, self.starts.shape[0])

@@ -13,6 +13,7 @@ import pytest
 from crossing_world import ego_at
 
 from carljax import config, presets, train
+from carljax.ppo import obs_storage
 from carljax.render import episode_view, image
 from carljax.reward.config import RewardConfig
 from carljax.sim import episodes, observation, observation_nuplan, raster_roach
@@ -72,6 +73,24 @@ def test_a_batch_is_a_loop_and_one_trace_is_enough(env, step):
         np.testing.assert_allclose(numbers[1], alone.obs.value_scalars, rtol=1e-5)
         other = np.asarray(batch.obs.raster[i]) != np.asarray(alone.obs.raster)
         assert other.any(axis=-1).mean() < 0.01
+
+
+def test_what_a_rollout_keeps_is_seen_again_bit_for_bit(env, step):
+    """In another batch size than it was drawn in, as the learner does it."""
+    states = [jax.jit(env.reset)(jax.random.key(5))]
+    for number in range(7):
+        states.append(step(env, states[-1], jnp.array([0.1 * (number - 3), 0.9])))
+    states = jax.tree.map(lambda *x: jnp.stack(x), *states)
+    for channel, levels in zip(jnp.moveaxis(states.obs.raster, -1, 0), env.levels, strict=True):
+        assert levels is None or set(np.unique(channel)) <= {0, *levels}
+    image_bytes = states.obs.raster.nbytes
+    for storage in (obs_storage.PACK, obs_storage.RERENDER):
+        kept = jax.jit(jax.vmap(storage.keep, in_axes=(None, 0)))(env, states)
+        part = jax.tree.map(lambda x: x[2:5], kept)
+        again = jax.jit(jax.vmap(storage.recall, in_axes=(None, 0)))(env, part)
+        jax.tree.map(lambda a, b: np.testing.assert_array_equal(a, b[2:5]), again, states.obs)
+        if storage is obs_storage.PACK:
+            assert kept.raster.nbytes <= image_bytes * 5 / 9
 
 
 def test_only_kinds_that_look_back_keep_something(env):
