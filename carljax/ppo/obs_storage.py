@@ -12,6 +12,7 @@ from collections.abc import Callable
 from typing import Any, Literal, NamedTuple
 
 import jax
+import jax.numpy as jnp
 
 from carljax.ppo import bit_pack
 from carljax.sim.autoreset import Env
@@ -57,7 +58,18 @@ def _keep_what_is_seen(env: Env, state: State) -> State:
 
 
 def _draw_again(env: Env, kept: State) -> Observation:
-    return env.observe(kept).obs
+    whole = jax.eval_shape(env.start, jax.random.key(0))
+    state = jax.tree.map(_or_blank, whole, kept)
+    return env.observe(state).obs
+
+
+def _or_blank(like: jax.ShapeDtypeStruct, kept: jax.Array | None) -> jax.Array:
+    """Returns what is kept, or an array of the shape of what is not: nobody reads its values."""
+    if kept is not None:
+        return kept
+    if jax.dtypes.issubdtype(like.dtype, jax.dtypes.prng_key):
+        return jnp.broadcast_to(jax.random.key(0), like.shape)
+    return jnp.zeros(like.shape, like.dtype)
 
 
 STORE = ObsStorage("store", lambda env, state: state.obs, lambda env, kept: kept)
