@@ -46,14 +46,18 @@ def _unpack(env: Env, kept: Observation) -> Observation:
 
 
 def _keep_what_is_seen(env: Env, state: State) -> State:
-    """Returns the state with None for every array that `observe` does not read."""
+    """Returns the state with None for every array that the observation does not depend on."""
     state = state.replace(obs=None)
     like = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), state)
     program = jax.make_jaxpr(lambda state: env.observe(state).obs)(like).jaxpr
-    read = {id(x) for equation in program.eqns for x in equation.invars}
-    read |= {id(x) for x in program.outvars}
+    needed = set(map(id, program.outvars))
+    for equation in reversed(program.eqns):
+        if not needed.isdisjoint(map(id, equation.outvars)):
+            needed.update(map(id, equation.invars))
     leaves, structure = jax.tree.flatten(state)
-    seen = [leaf if id(x) in read else None for leaf, x in zip(leaves, program.invars, strict=True)]
+    seen = [
+        leaf if id(x) in needed else None for leaf, x in zip(leaves, program.invars, strict=True)
+    ]
     return jax.tree.unflatten(structure, seen)
 
 
