@@ -65,7 +65,7 @@ def estimate(made: Setup) -> tuple[int, MemoryEstimate]:
             made.network, state.params, obs
         ),
     }
-    available = build.memory_of_device(num_devices)
+    available = build.memory_of_device(made.mesh)
     return count(state.params), MemoryEstimate(parts, available)
 
 

@@ -142,7 +142,8 @@ def run(command: Command, console: Console) -> int:
         if command.resume is None and distributed.is_first():
             run_dir.check_free(path)
         made = build.setup(wanted)
-    distributed.check_same("arguments, maps or routes", str(config.to_json(wanted)), made.env)
+    given = str(config.to_json(wanted)), made.storage.name
+    distributed.check_same("arguments, maps, routes or memory", given, made.env)
     describe(made, console)
     if command.dry_run:
         return 0
