@@ -17,7 +17,9 @@ import signal
 import sys
 import traceback
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager, suppress
+from pathlib import Path
+from tempfile import NamedTemporaryFile
 from typing import Annotated, Any
 
 import jax
@@ -189,6 +191,29 @@ def any_process(flag: bool) -> bool:
     if num_processes() == 1:
         return flag
     return bool(np.any(multihost_utils.process_allgather(np.array(flag))))
+
+
+def is_shared(folder: Path | None) -> bool:
+    """Whether all processes have the same folder there, and the first one can write into it.
+
+    Args:
+      folder: of this process; None if it has none.
+
+    Returns:
+      The same answer in all; True in a process on its own.
+    """
+    if num_processes() == 1:
+        return True
+    with ExitStack() as stack:
+        mark = ""
+        if is_first() and folder is not None:
+            with suppress(OSError):
+                folder.mkdir(parents=True, exist_ok=True)
+                file = stack.enter_context(NamedTemporaryFile(prefix=".shared-", dir=folder))
+                mark = Path(file.name).name
+        mark = gather(mark)[0]
+        is_here = folder is not None and mark != "" and (folder / mark).exists()
+        return not any_process(not is_here)
 
 
 @contextmanager

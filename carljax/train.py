@@ -137,7 +137,9 @@ def run(command: Command, console: Console) -> int:
     banks = tuple(file.resolve() for file in wanted.run.routes)
     cache = compile_cache.absolute(wanted.run.compile_cache)
     wanted = _with_run(wanted, dir=path, maps=maps, routes=banks, compile_cache=cache)
-    compile_cache.enable(cache)
+    if not distributed.is_shared(compile_cache.enable(cache)):
+        # What one process finds and another has to compile, XLA would let them tune together.
+        compile_cache.enable(compile_cache.OFF)
     with distributed.agreed():
         if command.resume is None and distributed.is_first():
             run_dir.check_free(path)

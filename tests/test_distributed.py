@@ -281,6 +281,40 @@ def test_what_is_compared_tells_arrays_apart(monkeypatch):
     assert len(set(digests)) == len(values)
 
 
+@pytest.mark.parametrize(
+    ("first", "here", "is_shared"),
+    [
+        ("a", "a", True),
+        ("a", "b", False),
+        ("a", None, False),
+        (None, "a", False),
+        ("file", "a", False),  # can't be written into
+    ],
+)
+def test_a_folder_is_shared_if_what_the_first_writes_is_there(
+    first, here, is_shared, tmp_path, monkeypatch
+):
+    """Two processes in turn, which tell each other what they have gathered."""
+    (tmp_path / "file").touch()
+    (tmp_path / "b").mkdir()
+    first, here = (None if name is None else tmp_path / name for name in (first, here))
+    answers = []
+
+    def gather(word):
+        monkeypatch.setattr(distributed, "gather", lambda _: [word, ""])
+        monkeypatch.setattr(distributed, "is_first", lambda: False)
+        answers.append(distributed.is_shared(here))
+        return [word, ""]
+
+    monkeypatch.setattr(distributed, "num_processes", lambda: 2)
+    monkeypatch.setattr(distributed, "any_process", lambda flag: flag)
+    monkeypatch.setattr(distributed, "gather", gather)
+    monkeypatch.setattr(distributed, "is_first", lambda: True)
+    answers.append(distributed.is_shared(first))
+    assert all(answers) == is_shared
+    assert not list(tmp_path.glob("a/*"))
+
+
 def test_alone_nothing_is_gathered():
     assert distributed.is_first()
     assert distributed.num_processes() == 1
