@@ -118,11 +118,13 @@ def road_map(roads: Sequence[Road]) -> RoadMap:
     origin, side = np.array([-REACH, -REACH]), int(2 * REACH * PIXELS_PER_METRE) + 1
     layers = atlas.layers(network, origin, (side, side))
     rest = {field.name: jnp.zeros(0) for field in dataclasses.fields(RoadMap)}
-    layers_and_origin = {
-        "layers": jnp.asarray(layers[None]),
+    picture = {
+        "layers": jnp.asarray(layers.reshape(-1)),
+        "picture_start": jnp.zeros(1, jnp.int32),
+        "picture_size": jnp.asarray([layers.shape], jnp.int32),
         "origin": jnp.asarray(origin[None], jnp.float32),
     }
-    return RoadMap(**{**rest, **layers_and_origin})
+    return RoadMap(**{**rest, **picture})
 
 
 def stack(scenes: Sequence[Scene]) -> Seen:

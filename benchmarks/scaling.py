@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import measure
+import numpy as np
 import tyro
 import workloads
 from measure import UsageError, Workload
@@ -202,7 +203,7 @@ def maps(command: Command) -> Iterator[Point]:
         )
         for make in (workloads.sim, workloads.render):
             made = point(command, make(env, command.num_envs, command.num_steps), kilometres)
-            pixels = list(env.bank.road_map.layers.shape[1:])
+            pixels = np.asarray(env.bank.road_map.picture_size)[0].tolist()
             yield {**made, "map": there.network.name, "atlas_shape": pixels}
 
 

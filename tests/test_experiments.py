@@ -221,7 +221,7 @@ def test_the_speed_is_that_of_the_median_update(monkeypatch):
     ends = np.cumsum(updates)
     readings = iter(np.stack([ends - updates, ends], axis=1).ravel())
     clock = types.SimpleNamespace(perf_counter=lambda: float(next(readings)))
-    made = types.SimpleNamespace(network=None, mesh=None, env=None)
+    made = types.SimpleNamespace(network=None, mesh=None, env=None, storage=None)
     monkeypatch.setattr(timing, "time", clock)
     monkeypatch.setattr(build, "setup", lambda config: made)
     monkeypatch.setattr(build, "initial_state", lambda made: jnp.zeros(()))

@@ -201,7 +201,8 @@ def test_a_dry_run_prints_size_and_memory_and_writes_nothing(tmp_path, capsys, m
     monkeypatch.chdir(tmp_path)
     assert train.main([*TINY, "--dry-run"]) == 0
     out = capsys.readouterr().out
-    for word in ("parameters", "rollout", "activations", "towns       village", "4 of 16 samples"):
+    expected = ("parameters", "batch of 16 samples (store)", "activations", "towns       village")
+    for word in (*expected, "4 of 16 samples"):
         assert word in out
     assert list(tmp_path.iterdir()) == []
 

@@ -227,7 +227,7 @@ def test_each_epoch_takes_every_sample_once_in_a_new_order(monkeypatch):
     config = PPOConfig(update_epochs=2, num_minibatches=4)
     taken = []
 
-    def record(params, samples, rows, network, config):
+    def record(params, samples, rows, network, config, recall):
         jax.debug.callback(lambda rows: taken.append(rows.tolist()), rows, ordered=True)
         return jax.tree.map(jnp.zeros_like, params), {"loss": jnp.float32(0.0)}
 
