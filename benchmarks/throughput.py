@@ -24,9 +24,10 @@ from carljax.sim.raster_canvas import RasterConfig
 from carljax.sim.town import Town
 
 SIM_ENVS, SIM_AGENTS, SIM_STEPS = 64, 32, 50
+TRAFFIC_ENVS = 512
 RENDER_ENVS, RENDER_AGENTS, RENDER_STEPS = 32, 50, 20
 
-Kind = Literal["sim", "render", "rollout", "update", "end_to_end"]
+Kind = Literal["sim", "traffic", "render", "rollout", "update", "end_to_end"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,7 +36,7 @@ class Command:
 
     preset: Literal["cpu", "carl-carla", "atari"] = "cpu"
     """Configuration of rollout, update and end_to_end."""
-    kinds: tuple[Kind, ...] = ("sim", "render", "rollout", "update", "end_to_end")
+    kinds: tuple[Kind, ...] = ("sim", "traffic", "render", "rollout", "update", "end_to_end")
     """Measurements to make."""
     repeats: int = 7
     """Timed calls, at least 5."""
@@ -96,6 +97,11 @@ def lines(command: Command, config: TrainConfig, towns: list[Town]) -> Iterator[
     if "sim" in command.kinds:
         env = workloads.environment(config, towns, command.num_routes, SIM_AGENTS)
         yield measure.run(workloads.sim(env, SIM_ENVS, SIM_STEPS), repeats)
+    if "traffic" in command.kinds:
+        alone = {"num_pedestrians": 0, "num_scenario_slots": 0}
+        env = workloads.environment(config, towns, command.num_routes, SIM_AGENTS, **alone)
+        made = measure.run(workloads.sim(env, TRAFFIC_ENVS, SIM_STEPS), repeats)
+        yield {**made, "benchmark": "traffic"}
     if "render" in command.kinds:
         for name, raster in rasters(command.observation):
             seen = {"raster": raster, "observation": command.observation}
