@@ -72,7 +72,7 @@ def measure(command: Command) -> dict[str, Any]:
     made = build.setup(dataclasses.replace(config, run=run))
     state = jax.block_until_ready(build.initial_state(made))
     lap("setup")
-    step: Any = trainer.make_train_step(made.network, config.ppo, made.mesh)
+    step: Any = trainer.make_train_step(made.network, config.ppo, made.mesh, made.storage)
     traced = step.trace(made.env, state)
     lap("trace")
     lowered = traced.lower()

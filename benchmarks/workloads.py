@@ -140,6 +140,7 @@ class Learner:
             "micro_batch_size": ppo.micro_batch_size,
             "update_epochs": ppo.update_epochs,
             "encoder": self.made.config.network.encoder,
+            "obs_storage": self.made.storage.name,
             "shape": list(self.state.env_state.obs.raster.shape[1:]),
         }
 
@@ -161,12 +162,13 @@ def learner(
     mesh = trainer.make_mesh(num_devices)
     env = build.environment(config, towns, num_routes, seed=0)
     network = ActorCritic(config.network)
-    made = build.Setup(config, towns, trainer.replicate(env, mesh), network, mesh)
+    storage = build.obs_storage_on(mesh, config)
+    made = build.Setup(config, towns, trainer.replicate(env, mesh), network, mesh, storage)
     return Learner(made, build.initial_state(made))
 
 
 def collect(learner: Learner) -> Workload:
-    """Observation, network, sampled action and simulator, with the advantages at the end."""
+    """Observation, network, sampled action, simulator and advantages; images are stored."""
     made, ppo = learner.made, learner.ppo
     program = measure.jit(functools.partial(_collect, network=made.network, ppo=ppo))
     return _of(learner, "rollout", program, (made.env, learner.state))
@@ -189,9 +191,9 @@ def learn(learner: Learner) -> Workload:
 
 
 def train(learner: Learner) -> Workload:
-    """The whole train step; it consumes the learner's state."""
+    """The whole train step, with the storage of training; it consumes the learner's state."""
     made = learner.made
-    program = trainer.make_train_step(made.network, learner.ppo, made.mesh)
+    program = trainer.make_train_step(made.network, learner.ppo, made.mesh, made.storage)
     workload = _of(learner, "end_to_end", program, (made.env, learner.state))
     return dataclasses.replace(workload, follow=lambda result: (made.env, result[0]))
 

@@ -13,7 +13,7 @@ from carljax import machine, route_bank
 from carljax.config import ConfigError, TrainConfig
 from carljax.ppo import obs_storage, trainer
 from carljax.ppo.networks import ActorCritic
-from carljax.ppo.obs_storage import STORE, ObsStorage
+from carljax.ppo.obs_storage import ObsStorage
 from carljax.ppo.types import TrainState
 from carljax.route_bank import BankError
 from carljax.sim import bank_padding, episodes, journey, town, towns
@@ -40,7 +40,7 @@ class Setup:
     env: DrivingEnv
     network: ActorCritic
     mesh: Mesh
-    storage: ObsStorage = STORE
+    storage: ObsStorage
 
 
 def setup(config: TrainConfig) -> Setup:

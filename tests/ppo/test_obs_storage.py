@@ -42,6 +42,20 @@ def test_updates_do_not_depend_on_how_observations_are_kept(name):
     assert float(stored[1]["ppo/grad_norm"]) > 0.0
 
 
+def test_seeds_side_by_side_draw_again_what_each_would_alone():
+    mesh = trainer.make_mesh(1)
+    env = trainer.replicate(toy_env.make(), mesh)
+
+    def after_one(storage):
+        keys = jax.random.key(0), jax.random.key(1)
+        runs = [trainer.init(key, env, NETWORK, CONFIG, mesh) for key in keys]
+        step = trainer.make_seeds_step(NETWORK, CONFIG, mesh, storage)
+        return jax.device_get(step(env, trainer.stack(runs, mesh))[0].params)
+
+    stored, again = after_one(obs_storage.STORE), after_one(obs_storage.RERENDER)
+    jax.tree.map(np.testing.assert_array_equal, stored, again)
+
+
 def test_to_draw_again_only_what_is_read_is_kept():
     env = toy_env.make()
     state = env.observe(env.start(jax.random.key(0)))
