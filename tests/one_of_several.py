@@ -41,7 +41,8 @@ def setup(values):
     values.validate(mesh.size)
     env = Named(starts=jnp.linspace(-0.8, 0.8, 9, dtype=jnp.float32))
     network = ActorCritic(values.network)
-    return build.Setup(values, (), trainer.replicate(env, mesh), network, mesh)
+    storage = build.obs_storage_on(mesh, values)
+    return build.Setup(values, (), trainer.replicate(env, mesh), network, mesh, storage)
 
 
 def score(course, policy):
