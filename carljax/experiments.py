@@ -75,8 +75,8 @@ class Command:
     samples: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
     """Environment steps of a training; the preset's own by default."""
     minutes: Annotated[float | None, tyro.conf.arg(metavar="MIN")] = None
-    """Instead of samples: as many as this machine makes in so much time, measured for each cell
-    before anything is trained, so do nothing else on it meanwhile."""
+    """Instead of samples: as many as this machine makes in so much time, measured for each cell in
+    turn with the first one before anything is trained, so do nothing else on it meanwhile."""
     preset: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
     """Preset that the cells are changes of; this machine's default."""
     dir: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
@@ -232,12 +232,11 @@ def _samples(
     """Samples that each cell is to be trained with; measured if minutes are given."""
     if command.minutes is None:
         return {cell.name: command.samples or base.ppo.total_samples for cell in cells}
+    rates = time_budget.samples_per_second([ablations.configure(cell, base, 1) for cell in cells])
     samples = {}
-    for cell in cells:
-        rate = time_budget.samples_per_second(ablations.configure(cell, base, 1))
+    for cell, rate in zip(cells, rates, strict=True):
         samples[cell.name] = max(round(60.0 * command.minutes * rate), 1)
         console.print(f"{cell.name}: {rate:,.0f} samples/s")
-        gc.collect()
     return samples
 
 

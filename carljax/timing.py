@@ -28,8 +28,22 @@ def call_seconds(
     """
     result, seconds = None, []
     for _ in range(warm_up + repeats):
-        given = jax.block_until_ready(arguments(result))
-        since = time.perf_counter()
-        result = jax.block_until_ready(function(*given))
-        seconds.append(time.perf_counter() - since)
+        taken, result = timed(function, *arguments(result))
+        seconds.append(taken)
     return seconds[warm_up:]
+
+
+def timed(function: Callable[..., Any], *given: Any) -> tuple[float, Any]:
+    """Calls a function once, when its arguments are there, and waits for what it returns.
+
+    Args:
+      function: returns arrays; jitted or compiled.
+      *given: its arguments.
+
+    Returns:
+      Seconds, and what the function returned.
+    """
+    jax.block_until_ready(given)
+    since = time.perf_counter()
+    result = jax.block_until_ready(function(*given))
+    return time.perf_counter() - since, result

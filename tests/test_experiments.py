@@ -194,16 +194,16 @@ def test_minutes_are_turned_into_samples_once(tmp_path, monkeypatch, capsys):
     """Each cell at its own speed; what was measured is kept for when the command goes on."""
     measured, trained = [], []
 
-    def speed(config):
-        measured.append(config.ppo.update_epochs)
-        return {4: 10.0, 3: 20.0}[config.ppo.update_epochs]
+    def speeds(configs):
+        measured.extend(config.ppo.update_epochs for config in configs)
+        return [{4: 10.0, 3: 20.0}[config.ppo.update_epochs] for config in configs]
 
     def interrupted(cell, config, *_):
         trained.append((cell.name, config.ppo.total_samples))
         return cell.name == "4 epochs"
 
     monkeypatch.setitem(presets.PRESETS, "tiny", presets.Preset("small", TINY))
-    monkeypatch.setattr(time_budget, "samples_per_second", speed)
+    monkeypatch.setattr(time_budget, "samples_per_second", speeds)
     monkeypatch.setattr(experiments, "_train", interrupted)
     args = ["epochs", "--preset", "tiny", "--dir", str(tmp_path), "--minutes"]
     for _ in range(2):
@@ -215,9 +215,8 @@ def test_minutes_are_turned_into_samples_once(tmp_path, monkeypatch, capsys):
     assert measured == [4, 3]
 
 
-def test_the_speed_is_that_of_the_median_update(monkeypatch):
-    """The first, which compiles, and the second do not count."""
-    updates = [50.0, 9.0, 1.0, 2.0, 7.0, 4.0, 6.0, 5.0, 3.0]
+def _taking(monkeypatch, *updates):
+    """The clock of trainings whose updates take so many seconds, in the order of the calls."""
     ends = np.cumsum(updates)
     readings = iter(np.stack([ends - updates, ends], axis=1).ravel())
     clock = types.SimpleNamespace(perf_counter=lambda: float(next(readings)))
@@ -227,7 +226,24 @@ def test_the_speed_is_that_of_the_median_update(monkeypatch):
     monkeypatch.setattr(build, "initial_state", lambda made: jnp.zeros(()))
     step = lambda env, state: (state + 1, {})  # noqa: E731
     monkeypatch.setattr(trainer, "make_train_step", lambda *_: step)
-    assert time_budget.samples_per_second(TINY) == TINY.ppo.batch_size / 4.0
+    return readings
+
+
+def test_the_speed_is_that_of_the_median_update(monkeypatch):
+    """The first, which compiles, and the second do not count."""
+    readings = _taking(monkeypatch, 50.0, 9.0, 1.0, 2.0, 7.0, 4.0, 6.0, 5.0, 3.0)
+    assert time_budget.samples_per_second([TINY]) == [TINY.ppo.batch_size / 4.0]
+    assert next(readings, None) is None
+
+
+def test_a_machine_that_slows_down_slows_nobody_against_the_others(monkeypatch):
+    """The second takes twice the first's time; the third is timed when all take three times it."""
+    warm_up, second, third = [50.0, 9.0], 7 * [1.0, 2.0], 7 * [3.0, 1.5]
+    readings = _taking(monkeypatch, *warm_up, *warm_up, *second, *warm_up, *third)
+    batch = TINY.ppo.batch_size
+    # The first one's median over both times is 2 s.
+    expected = [batch / 2.0, batch / 4.0, batch / 1.0]
+    np.testing.assert_allclose(time_budget.samples_per_second(3 * [TINY]), expected)
     assert next(readings, None) is None
 
 
