@@ -33,6 +33,9 @@ class NetworkConfig:
     """Side of the square patches that the patch encoder maps to features, px."""
     patch_features: tuple[int, int] = (32, 64)
     """Features of a patch, and of the 2 x 2 patches that are joined after it."""
+    compute_dtype: Literal["float32", "bfloat16"] = "float32"
+    """Type of activations and products. Parameters, the statistics of LayerNorms, the last layer of
+    each head and the losses stay float32; bfloat16 pays on GPUs and TPUs, not on CPUs."""
 
 
 @dataclasses.dataclass(frozen=True)

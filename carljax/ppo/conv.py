@@ -28,12 +28,12 @@ def conv(x: jax.Array, w: jax.Array, stride: int) -> jax.Array:
     """Convolves without padding.
 
     Args:
-      x: (N, H, W, I) float32.
-      w: (K, K, I, O) float32.
+      x: (N, H, W, I) float32 or bfloat16.
+      w: (K, K, I, O) of the same type.
       stride: step in both directions.
 
     Returns:
-      (N, (H - K) // stride + 1, (W - K) // stride + 1, O) float32.
+      (N, (H - K) // stride + 1, (W - K) // stride + 1, O) of that type.
     """
     return _plain(x, w, stride)
 
@@ -127,34 +127,35 @@ def patch_conv(x: jax.Array, w: jax.Array, size: int) -> jax.Array:
     """Convolves with a stride equal to the kernel: one matrix product over the patches.
 
     Args:
-      x: (N, H, W, I) uint8 or float32; H and W are multiples of `size`.
-      w: (size, size, I, O) float32.
+      x: (N, H, W, I) uint8 or `w`'s type; H and W are multiples of `size`.
+      w: (size, size, I, O) float32 or bfloat16.
       size: side of a patch.
 
     Returns:
-      (N, H / size, W / size, O) float32.
+      (N, H / size, W / size, O) of `w`'s type.
     """
     return jax.lax.platform_dependent(
         x, w, cpu=_by_rows(size), default=lambda x, w: _plain(x.astype(w.dtype), w, size)
     )
 
 
-def _patch_rows(x: jax.Array, size: int) -> list[jax.Array]:
-    """Returns, for each row of a patch, (patches, size * I) float32.
+def _patch_rows(x: jax.Array, size: int, dtype: jnp.dtype) -> list[jax.Array]:
+    """Returns, for each row of a patch, (patches, size * I) of a type.
 
     A row of a patch is contiguous in the image. To work on one at a time costs no transpose, and
     the float32 copy of a small image's row fits the cache where that of the image doesn't.
     """
     num, height, width, channels = x.shape
     x = x.reshape(num, height // size, size, width // size, size * channels)
-    return [x[:, :, i].reshape(-1, size * channels).astype(jnp.float32) for i in range(size)]
+    return [x[:, :, i].reshape(-1, size * channels).astype(dtype) for i in range(size)]
 
 
 def _by_rows(size: int) -> Callable[[jax.Array, jax.Array], jax.Array]:
     def product(x: jax.Array, w: jax.Array) -> jax.Array:
         num, height, width, _ = x.shape
         kernels = w.reshape(size, -1, w.shape[-1])
-        out = sum(row @ kernel for row, kernel in zip(_patch_rows(x, size), kernels, strict=True))
+        rows = _patch_rows(x, size, w.dtype)
+        out = sum(row @ kernel for row, kernel in zip(rows, kernels, strict=True))
         return jnp.reshape(out, (num, height // size, width // size, w.shape[-1]))
 
     return product
@@ -180,7 +181,8 @@ def _patch_conv_bwd(
         # Contracting over the rows of both is three times slower on a CPU than with one transposed;
         # the barriers keep XLA from folding the transposes back into the products.
         transposed = jax.lax.optimization_barrier(g.reshape(-1, g.shape[-1]).T)
-        products = jax.lax.optimization_barrier([transposed @ row for row in _patch_rows(x, size)])
+        rows = _patch_rows(x, size, w.dtype)
+        products = jax.lax.optimization_barrier([transposed @ row for row in rows])
         return jnp.stack([product.T for product in products]).reshape(w.shape)
 
     dw = jax.lax.platform_dependent(x, w, g, cpu=fast, default=plain)
@@ -200,11 +202,11 @@ def matmul(x: jax.Array, w: jax.Array) -> jax.Array:
     """Multiplies samples by weights.
 
     Args:
-      x: (N, I) float32.
-      w: (I, O) float32.
+      x: (N, I) float32 or bfloat16.
+      w: (I, O) of the same type.
 
     Returns:
-      (N, O) float32.
+      (N, O) of that type.
     """
     return x @ w
 

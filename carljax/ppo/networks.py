@@ -80,16 +80,23 @@ def forward(
 
 
 class Linear(nn.Module):
-    """A linear layer with PyTorch's default initialisation."""
+    """A linear layer with PyTorch's default initialisation.
+
+    Attributes:
+      features: of the output.
+      dtype: of product and output; the parameters are float32.
+    """
 
     features: int
+    dtype: str = "float32"
 
     @nn.compact
     def __call__(self, x: jax.Array) -> jax.Array:
         """Maps (N, I) to (N, features)."""
         init = _torch_init(x.shape[-1])
         kernel = self.param("kernel", init, (x.shape[-1], self.features))
-        return matmul(x, kernel) + self.param("bias", init, (self.features,))
+        bias = self.param("bias", init, (self.features,))
+        return matmul(x.astype(self.dtype), kernel.astype(self.dtype)) + bias.astype(self.dtype)
 
 
 class Mlp(nn.Module):
@@ -101,10 +108,11 @@ class Mlp(nn.Module):
     @nn.compact
     def __call__(self, x: jax.Array) -> jax.Array:
         """Maps (N, I) to (N, sizes[-1])."""
+        dtype = self.config.compute_dtype
         for size in self.sizes:
-            x = Linear(size)(x)
+            x = Linear(size, dtype)(x)
             if self.config.layer_norm:
-                x = nn.LayerNorm(epsilon=NORM_EPS)(x)
+                x = nn.LayerNorm(epsilon=NORM_EPS, dtype=dtype)(x)
             x = nn.relu(x)
         return x
 
@@ -122,15 +130,18 @@ class ConvEncoder(nn.Module):
 
     @nn.compact
     def __call__(self, raster: jax.Array) -> jax.Array:
-        """Maps (N, H, W, C) uint8 to (N, features) float32."""
-        x = raster.astype(jnp.float32) * jnp.float32(1.0 / 255.0)
+        """Maps (N, H, W, C) uint8 to (N, features) of `NetworkConfig.compute_dtype`."""
+        dtype = self.config.compute_dtype
+        x = raster.astype(dtype) * jnp.asarray(1.0 / 255.0, dtype)
         for i, (features, kernel, stride) in enumerate(CONV_LAYERS[self.config.encoder]):
             weight, bias = _conv_params(self, i, (kernel, kernel, x.shape[-1], features))
             padding, stride = conv_fit(x.shape[1:3], kernel, stride)
-            x = conv(jnp.pad(x, ((0, 0), *padding, (0, 0))), weight, stride) + bias
+            x = jnp.pad(x, ((0, 0), *padding, (0, 0)))
+            x = conv(x, weight.astype(dtype), stride) + bias.astype(dtype)
             if self.config.layer_norm:
                 axes = (-3, -2, -1)
-                x = nn.LayerNorm(epsilon=NORM_EPS, reduction_axes=axes, feature_axes=axes)(x)
+                norm = nn.LayerNorm(NORM_EPS, dtype, reduction_axes=axes, feature_axes=axes)
+                x = norm(x)
             x = nn.relu(x)
         return x.reshape(x.shape[0], -1)
 
@@ -164,8 +175,8 @@ class PatchEncoder(nn.Module):
 
     @nn.compact
     def __call__(self, raster: jax.Array) -> jax.Array:
-        """Maps (N, H, W, C) uint8 to (N, features) float32."""
-        x = raster
+        """Maps (N, H, W, C) uint8 to (N, features) of `NetworkConfig.compute_dtype`."""
+        x, dtype = raster, self.config.compute_dtype
         sizes = (self.config.patch_size, 2)
         # uint8 goes in as it is and the 1 / 255 onto the weights: one pass less over the image.
         scales = (jnp.float32(1.0 / 255.0), jnp.float32(1.0))
@@ -173,9 +184,10 @@ class PatchEncoder(nn.Module):
         for i, (size, features, scale) in enumerate(layers):
             weight, bias = _conv_params(self, i, (size, size, x.shape[-1], features))
             padding = [(0, -n % size) for n in x.shape[1:3]]
-            x = patch_conv(jnp.pad(x, ((0, 0), *padding, (0, 0))), weight * scale, size) + bias
+            x = jnp.pad(x, ((0, 0), *padding, (0, 0)))
+            x = patch_conv(x, (weight * scale).astype(dtype), size) + bias.astype(dtype)
             if self.config.layer_norm:
-                x = nn.LayerNorm(epsilon=NORM_EPS)(x)
+                x = nn.LayerNorm(epsilon=NORM_EPS, dtype=dtype)(x)
             x = nn.relu(x)
         return x.reshape(x.shape[0], -1)
 

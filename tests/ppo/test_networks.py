@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import fill
 import jax
 import jax.numpy as jnp
@@ -162,3 +164,51 @@ def test_beta_min_bounds_alpha_and_beta():
         outputs.append(network.apply(fill.params(network, obs), obs))
     for lower, higher in zip(outputs[0][:2], outputs[1][:2], strict=True):
         np.testing.assert_allclose(higher - lower, 1.0, atol=1e-6)
+
+
+@pytest.mark.parametrize("encoder", ["carl", "roach", "patch"])
+def test_bfloat16_products_say_what_float32_ones_do(encoder):
+    """Outputs and gradients of float32 parameters, as near as eight bits of mantissa allow."""
+    obs = _obs(8, 64)
+    plain = ActorCritic(NetworkConfig(encoder=encoder))
+    params = jax.tree.map(lambda x: x + 0.01, plain.init(jax.random.key(0), obs))
+
+    def loss(params, network):
+        alpha, beta, value = network.apply(params, obs)
+        return jnp.mean(jnp.log(alpha) * value[:, None] + beta), (alpha, beta, value)
+
+    def of(dtype):
+        network = ActorCritic(NetworkConfig(encoder=encoder, compute_dtype=dtype))
+        return jax.jit(jax.value_and_grad(loss, has_aux=True), static_argnums=1)(params, network)
+
+    ((_, exact), exact_gradient), ((_, near), gradient) = of("float32"), of("bfloat16")
+    for one, other in zip(exact, near, strict=True):
+        assert other.dtype == jnp.float32
+        assert 0.0 < np.abs(other - one).max() < 0.05 * np.abs(one).max()
+    for (path, one), other in zip(
+        jax.tree_util.tree_leaves_with_path(exact_gradient), jax.tree.leaves(gradient), strict=True
+    ):
+        assert other.dtype == jnp.float32
+        cosine = jnp.vdot(one, other) / (jnp.linalg.norm(one) * jnp.linalg.norm(other))
+        # Least for biases before a LayerNorm, whose gradients are sums of opposite numbers.
+        assert cosine > 0.9, (jax.tree_util.keystr(path), cosine)
+
+
+@pytest.mark.parametrize("encoder", ["carl", "patch"])
+def test_bfloat16_is_the_type_of_all_large_products(encoder):
+    """All but the last layer of each head, forward and backward, as an accelerator gets them."""
+    obs = _obs(8, 64)
+    network = ActorCritic(NetworkConfig(encoder=encoder, compute_dtype="bfloat16"))
+    params = jax.eval_shape(network.init, jax.random.key(0), obs)
+
+    def loss(params):
+        return sum(jnp.sum(x) for x in network.apply(params, obs))
+
+    traced = jax.jit(jax.value_and_grad(loss)).trace(params)
+    text = traced.lower(lowering_platforms=("cuda",)).as_text()
+    products = [line for line in text.splitlines() if re.search("dot_general|convolution", line)]
+    types = [re.findall(r"tensor<(?:\d+x)*(\w+)>", line) for line in products]
+    assert {name for each in types for name in each} == {"f32", "bf16"}
+    # alpha, beta and value: forward, and the gradients of weights and inputs.
+    assert sum("f32" in each for each in types) == 9
+    assert sum("f32" not in each for each in types) > 20
