@@ -27,8 +27,7 @@ DRIVABLE, ROUTE, BORDERS, LIGHTS, STOPS, LIMITS, CARS, WALKERS, EGO = range(9)
 CAR = {"length": 4.0, "width": 2.0, "kind": KIND_VEHICLE}
 
 
-@pytest.fixture(scope="module")
-def env(bundled):
+def environment(bundled):
     """The grid and the village with two routes each."""
     there = [bundled["grid"], bundled["village"]]
     bank = episodes.make_bank(there, 4, Population(2, 0, 0), 5, route_length=400.0)
@@ -36,6 +35,11 @@ def env(bundled):
         num_agents=2, num_pedestrians=0, num_scenario_slots=0, observation="nuplan", raster=SMALL
     )
     return make_env(bank, config, RewardConfig())
+
+
+@pytest.fixture(scope="module")
+def env(bundled):
+    return environment(bundled)
 
 
 @functools.partial(jax.jit, static_argnames=("config", "options"))
