@@ -23,39 +23,73 @@ SIDE = 0.5  # m kept to either side. source: ours
 
 
 class Obstacles(struct.PyTreeNode):
-    """What may be in the way, (F,): valid bool; x, y m; yaw rad; speed m/s; length, width m."""
+    """What may be in the way, (F,).
+
+    Attributes:
+      valid: bool.
+      x, y: m.
+      cos, sin: of the heading.
+      speed: m/s.
+      moves: m that it will have gone in `FORESIGHT`, 0 for the ego.
+      half_length, half_width: m.
+    """
 
     valid: jax.Array
     x: jax.Array
     y: jax.Array
-    yaw: jax.Array
+    cos: jax.Array
+    sin: jax.Array
     speed: jax.Array
-    length: jax.Array
-    width: jax.Array
+    moves: jax.Array
+    half_length: jax.Array
+    half_width: jax.Array
 
 
 def obstacles(others: Agents, ego: EgoState, ego_length: jax.Array) -> Obstacles:
-    """The ego, others where they are, and others where they will be in `FORESIGHT`."""
-    ahead = jnp.stack([jnp.cos(others.yaw), jnp.sin(others.yaw)], axis=-1)
-    then = others.xy + (FORESIGHT * others.speed)[:, None] * ahead
+    """The ego and others."""
 
-    def rows(of_ego: jax.Array, now: jax.Array, then: jax.Array) -> jax.Array:
-        return jnp.concatenate([of_ego[None], now, then])
+    def rows(of_ego: jax.Array, of_others: jax.Array) -> jax.Array:
+        return jnp.concatenate([of_ego[None], of_others])
 
-    moves = others.valid & (others.speed > 0.0)
+    yaw = rows(ego.yaw, others.yaw)
     return Obstacles(
-        valid=rows(jnp.ones((), bool), others.valid, moves),
-        x=rows(ego.xy[0], others.xy[:, 0], then[:, 0]),
-        y=rows(ego.xy[1], others.xy[:, 1], then[:, 1]),
-        yaw=rows(ego.yaw, others.yaw, others.yaw),
-        speed=rows(ego.speed, others.speed, others.speed),
-        length=rows(ego_length, others.length, others.length),
-        width=rows(jnp.float32(EGO_WIDTH), others.width, others.width),
+        valid=rows(jnp.ones((), bool), others.valid),
+        x=rows(ego.xy[0], others.xy[:, 0]),
+        y=rows(ego.xy[1], others.xy[:, 1]),
+        cos=jnp.cos(yaw),
+        sin=jnp.sin(yaw),
+        speed=rows(ego.speed, others.speed),
+        moves=rows(jnp.zeros(()), FORESIGHT * jnp.maximum(others.speed, 0.0)),
+        half_length=0.5 * rows(ego_length, others.length),
+        half_width=0.5 * rows(jnp.float32(EGO_WIDTH), others.width),
     )
+
+
+class Piece(struct.PyTreeNode):
+    """A straight piece of an agent's way, (N, P).
+
+    Attributes:
+      x, y: m, where it begins.
+      cos, sin: of its heading.
+      least, most: m from its beginning between which an obstacle's middle is in the way.
+      half_width: m, half of the agent's width and what is kept beside it.
+      gap: m from the front bumper to its beginning; negative for the first one.
+    """
+
+    x: jax.Array
+    y: jax.Array
+    cos: jax.Array
+    sin: jax.Array
+    least: jax.Array
+    most: jax.Array
+    half_width: jax.Array
+    gap: jax.Array
 
 
 def gaps(agents: Agents, seen: Obstacles, road_map: RoadMap) -> tuple[jax.Array, jax.Array]:
     """Gap to the nearest obstacle in each agent's way, and its speed along that way.
+
+    Each is looked at twice: where it is and where it will be.
 
     Args:
       agents: (N,) vehicles on lanes.
@@ -65,28 +99,49 @@ def gaps(agents: Agents, seen: Obstacles, road_map: RoadMap) -> tuple[jax.Array,
     Returns:
       (N,) m between bumper and obstacle, FAR where there is none; (N,) m/s.
     """
+    # Numbers for one of a pair are all made before those for pairs, of which there are N P F.
+    way = jax.tree.map(lambda x: x[..., None], once(_pieces(agents, road_map)))
+    seen = once(seen)
+    x, y = seen.x - way.x, seen.y - way.y
+    ahead, left = way.cos * x + way.sin * y, way.cos * y - way.sin * x
+    cos, sin = way.cos * seen.cos + way.sin * seen.sin, way.cos * seen.sin - way.sin * seen.cos
+    along = seen.half_length * jnp.abs(cos) + seen.half_width * jnp.abs(sin)
+    across = seen.half_length * jnp.abs(sin) + seen.half_width * jnp.abs(cos) + way.half_width
+
+    def near(ahead: jax.Array, left: jax.Array) -> jax.Array:
+        in_way = seen.valid & (jnp.abs(left) < across) & (ahead > way.least) & (ahead < way.most)
+        return jnp.where(in_way, ahead, FAR)
+
+    now, then = near(ahead, left), near(ahead + seen.moves * cos, left + seen.moves * sin)
+    gap = jnp.minimum(now, then) - along  # (N, P, F)
+    gap, speed = _nearest(gap, seen.speed * jnp.maximum(cos, 0.0))
+    gap, speed = _nearest(gap + way.gap[..., 0], speed)
+    return jnp.where(gap < 0.5 * FAR, gap, FAR), jnp.where(gap < 0.5 * FAR, speed, 0.0)
+
+
+def _nearest(gap: jax.Array, speed: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Returns the smallest gap of the last axis and its speed, the highest of equals."""
+    nearest = gap.min(axis=-1)
+    return nearest, jnp.where(gap == nearest[..., None], speed, 0.0).max(axis=-1)
+
+
+def _pieces(agents: Agents, road_map: RoadMap) -> Piece:
+    """The way of each agent in straight pieces."""
     points, along = _way(agents, road_map)  # (N, P + 1, 2), (N, P + 1)
     piece = points[:, 1:] - points[:, :-1]
     length = jnp.sqrt(jnp.maximum((piece**2).sum(axis=-1), 1e-6))
-    cos, sin = piece[..., 0] / length, piece[..., 1] / length  # (N, P)
-    pieces = (points[:, :-1, 0], points[:, :-1, 1], cos, sin, length, along[:, :-1])
-    from_x, from_y, cos, sin, length, along = (x[..., None] for x in once(pieces))
-    cos_seen, sin_seen, seen = once((jnp.cos(seen.yaw), jnp.sin(seen.yaw), seen))
-    x, y = seen.x - from_x, seen.y - from_y  # (N, P, F)
-    ahead, side = cos * x + sin * y, jnp.abs(cos * y - sin * x)
-    cos_to = cos * cos_seen + sin * sin_seen
-    sin_to = jnp.abs(sin * cos_seen - cos * sin_seen)
-    half_along = 0.5 * (seen.length * jnp.abs(cos_to) + seen.width * sin_to)
-    half_across = 0.5 * (seen.length * sin_to + seen.width * jnp.abs(cos_to))
-    across = half_across + (0.5 * agents.width + SIDE)[:, None, None]
-    distance = along + ahead
-    in_way = seen.valid & (side < across) & (distance > 0.3 * agents.length[:, None, None])
-    in_way &= (ahead > -0.5) & (ahead < length + 0.5)
-    gap = distance - half_along - 0.5 * agents.length[:, None, None]
-    gap = jnp.where(in_way, gap, FAR).reshape(agents.length.shape[0], -1)
-    speed = (seen.speed * jnp.maximum(cos_to, 0.0)).reshape(gap.shape)
-    nearest = gap.min(axis=1)
-    return nearest, jnp.where(gap == nearest[:, None], speed, 0.0).max(axis=1)
+    along = along[:, :-1]
+    size = agents.length[:, None]
+    return Piece(
+        x=points[:, :-1, 0],
+        y=points[:, :-1, 1],
+        cos=piece[..., 0] / length,
+        sin=piece[..., 1] / length,
+        least=jnp.maximum(0.3 * size - along, -0.5),
+        most=length + 0.5,
+        half_width=jnp.broadcast_to(0.5 * agents.width[:, None] + SIDE, along.shape),
+        gap=along - 0.5 * size,
+    )
 
 
 def _way(agents: Agents, road_map: RoadMap) -> tuple[jax.Array, jax.Array]:

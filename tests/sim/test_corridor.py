@@ -119,3 +119,65 @@ def test_stops_for_a_pedestrian_and_goes_on_when_the_way_is_free(world):
 def test_empty_rows_are_in_nobodys_way(world):
     nobody = person((-35.0, 0.0)).replace(kind=jnp.zeros(1, jnp.int32))
     assert gap(world, nobody)[0] > 900
+
+
+def near_by_loops(length, width, points, along, users):
+    """The nearest obstacle of one agent, in float64: (gap, speed along the way), or None.
+
+    Users are (x, y, yaw, speed, length, width); each counts where it is and where it will be.
+    """
+    found = []
+    for x, y, yaw, speed, long, wide in users:
+        for seconds in (0.0, 1.5):
+            at = np.array([x, y]) + seconds * speed * np.array([np.cos(yaw), np.sin(yaw)])
+            for begin, end, gone in zip(points[:-1], points[1:], along[:-1], strict=True):
+                way = np.hypot(*(end - begin))
+                angle = np.arctan2(*(end - begin)[::-1])
+                cos, sin = np.cos(angle), np.sin(angle)
+                ahead, left = np.array([[cos, sin], [-sin, cos]]) @ (at - begin)
+                cos_to, sin_to = abs(np.cos(yaw - angle)), abs(np.sin(yaw - angle))
+                across = 0.5 * (long * sin_to + wide * cos_to) + 0.5 * width + 0.5
+                if abs(left) < across and -0.5 < ahead < way + 0.5 and gone + ahead > 0.3 * length:
+                    far = 0.5 * (long * cos_to + wide * sin_to) + 0.5 * length
+                    follows = speed * max(np.cos(yaw - angle), 0.0)
+                    found.append((gone + ahead - far, follows))
+    return min(found, key=lambda pair: (pair[0], -pair[1])) if found else None
+
+
+def test_random_crowds_match_loops(world):
+    rng = np.random.default_rng(0)
+    rows = [world.row("road", k) for k in range(3)]
+    num = 8
+    starts, speeds = rng.uniform(5.0, 45.0, num), rng.uniform(0.0, 15.0, num)
+    agents = cars(
+        world,
+        *({"lanes": rows, "lane_s": s, "speed": v} for s, v in zip(starts, speeds, strict=True)),
+    )
+    ego = make_ego()
+    seen_some = 0
+    for _ in range(20):
+        crowd = 5
+        users = np.stack(
+            [
+                *(rng.uniform(-75, 10, crowd), rng.uniform(-6, 6, crowd)),
+                *(rng.uniform(-3.1, 3.1, crowd), rng.choice([0.0, 1.4, 6.0], crowd)),
+                *(rng.uniform(0.4, 2.0, crowd), rng.uniform(0.4, 2.0, crowd)),
+            ],
+            axis=1,
+        )
+        fields = dict(zip(("yaw", "speed", "length", "width"), users[:, 2:].T, strict=True))
+        others = with_values(
+            crowd, {"kind": [KIND_PEDESTRIAN] * crowd, "xy": users[:, :2], **fields}
+        )
+        got = gaps_jit(agents, others, ego, world.map)
+        points, along = (np.asarray(x, np.float64) for x in corridor._way(agents, world.map))
+        ego_box = (*ego.xy, ego.yaw, 0.0, EGO_LENGTH, corridor.EGO_WIDTH)
+        for k in range(num):
+            size = float(agents.length[k]), float(agents.width[k])
+            want = near_by_loops(*size, points[k], along[k], [*users, ego_box])
+            if want is None:
+                assert float(got[0][k]) == corridor.FAR and float(got[1][k]) == 0.0
+            else:
+                seen_some += 1
+                np.testing.assert_allclose((got[0][k], got[1][k]), want, rtol=1e-4, atol=1e-3)
+    assert 20 < seen_some < 140
