@@ -32,7 +32,7 @@ CONFIDENCE = 0.95
 # Fields that tell two lines of one benchmark apart.
 KEY = ("benchmark", "raster", "preset", "observation")
 
-Kind = Literal["sim", "render", "rollout", "update", "end_to_end"]
+Kind = Literal["sim", "traffic", "render", "rollout", "update", "end_to_end"]
 
 
 class CompareError(ValueError):
@@ -47,7 +47,7 @@ class Command:
     """Git revision, or directory of a checkout."""
     new: tyro.conf.Positional[str]
     """Likewise."""
-    kinds: tuple[Kind, ...] = ("sim", "render", "rollout", "update", "end_to_end")
+    kinds: tuple[Kind, ...] = ("sim", "traffic", "render", "rollout", "update", "end_to_end")
     """Passed on to the benchmark."""
     rounds: int = 5
     """Pairs of runs, at least 3."""
