@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import io
 import json
 import os
 import signal
@@ -13,12 +14,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import once
+from rich.console import Console
 
 from carljax import (
     ablations,
     build,
     checkpoint,
     courses,
+    experiment_report,
     experiments,
     learn,
     metrics_log,
@@ -122,6 +125,18 @@ def test_a_run_logs_its_own_samples_and_not_those_of_all(experiment):
         lines = metrics_log.read(experiment[0] / "3-epochs" / f"seed-{seed}")
         assert [line["env_steps"] for line in lines] == [16, 32]
         assert [line[SPEED] for line in lines] == [16.0, 16.0]
+
+
+def test_a_terminal_of_80_columns_shows_cells_and_scores(monkeypatch):
+    spread = {name: (31.25, 4.04) for name in experiment_report.COLUMNS}
+    label = "Roach, minibatch 1024"
+    monkeypatch.setattr(experiment_report, "table", lambda rows: [(label, spread)])
+    console = Console(width=80, record=True, file=io.StringIO())
+    row = experiment_report.Row(label, "mean", 10_000_000, ())
+    experiment_report.show([row], "A title", console)
+    text = console.export_text()
+    assert label in text and "10,000,000" in text and text.count("31.2 ± 4.0") == 3
+    assert "…" not in text
 
 
 def test_there_is_a_plot(experiment):
