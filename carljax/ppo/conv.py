@@ -35,10 +35,11 @@ def conv(x: jax.Array, w: jax.Array, stride: int) -> jax.Array:
     Returns:
       (N, (H - K) // stride + 1, (W - K) // stride + 1, O) of that type.
     """
-    return _plain(x, w, stride)
+    return plain_conv(x, w, stride)
 
 
-def _plain(x: jax.Array, w: jax.Array, stride: int) -> jax.Array:
+def plain_conv(x: jax.Array, w: jax.Array, stride: int) -> jax.Array:
+    """Returns what `conv` does, by XLA's own convolution and with its gradients."""
     strides = (stride, stride)
     return jax.lax.conv_general_dilated(x, w, strides, "VALID", dimension_numbers=_NHWC)
 
@@ -46,7 +47,7 @@ def _plain(x: jax.Array, w: jax.Array, stride: int) -> jax.Array:
 def _conv_fwd(
     x: jax.Array, w: jax.Array, stride: int
 ) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
-    return _plain(x, w, stride), (x, w)
+    return plain_conv(x, w, stride), (x, w)
 
 
 def _conv_bwd(
@@ -55,7 +56,7 @@ def _conv_bwd(
     x, w = residuals
 
     def plain(x: jax.Array, w: jax.Array, g: jax.Array) -> tuple[jax.Array, jax.Array]:
-        _, pull_back = jax.vjp(lambda x, w: _plain(x, w, stride), x, w)
+        _, pull_back = jax.vjp(lambda x, w: plain_conv(x, w, stride), x, w)
         return pull_back(g)
 
     def fast(x: jax.Array, w: jax.Array, g: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -135,7 +136,7 @@ def patch_conv(x: jax.Array, w: jax.Array, size: int) -> jax.Array:
       (N, H / size, W / size, O) of `w`'s type.
     """
     return jax.lax.platform_dependent(
-        x, w, cpu=_by_rows(size), default=lambda x, w: _plain(x.astype(w.dtype), w, size)
+        x, w, cpu=_by_rows(size), default=lambda x, w: plain_conv(x.astype(w.dtype), w, size)
     )
 
 
@@ -175,7 +176,7 @@ def _patch_conv_bwd(
 
     def plain(x: jax.Array, w: jax.Array, g: jax.Array) -> jax.Array:
         x = x.astype(w.dtype)
-        return jax.vjp(lambda w: _plain(x, w, size), w)[1](g)[0]
+        return jax.vjp(lambda w: plain_conv(x, w, size), w)[1](g)[0]
 
     def fast(x: jax.Array, w: jax.Array, g: jax.Array) -> jax.Array:
         # Contracting over the rows of both is three times slower on a CPU than with one transposed;

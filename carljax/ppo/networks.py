@@ -15,10 +15,12 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import linen as nn
 
 from carljax.ppo.config import NetworkConfig
 from carljax.ppo.conv import conv, matmul, patch_conv
+from carljax.ppo.image_conv import image_conv
 from carljax.sim.types import Observation
 
 # Channels, kernel, stride of each convolution. source: CaRL paper, "Architecture" (and Roach's).
@@ -28,6 +30,7 @@ CONV_LAYERS = {
 }
 CONV_BIAS = 0.1  # source: Roach's initialisation, kept by CaRL
 NORM_EPS = 1e-5  # source: PyTorch's default, which the paper's trainer used
+_BYTE = np.float32(1.0 / 255.0)  # of a pixel's largest value, 1
 _MIN_SIZE = 2  # height and width of the paper's last feature map
 
 _xavier = nn.initializers.variance_scaling(2.0, "fan_avg", "uniform")  # with ReLU's gain, sqrt 2
@@ -131,13 +134,16 @@ class ConvEncoder(nn.Module):
     @nn.compact
     def __call__(self, raster: jax.Array) -> jax.Array:
         """Maps (N, H, W, C) uint8 to (N, features) of `NetworkConfig.compute_dtype`."""
-        dtype = self.config.compute_dtype
-        x = raster.astype(dtype) * jnp.asarray(1.0 / 255.0, dtype)
+        x, dtype = raster, self.config.compute_dtype
         for i, (features, kernel, stride) in enumerate(CONV_LAYERS[self.config.encoder]):
             weight, bias = _conv_params(self, i, (kernel, kernel, x.shape[-1], features))
             padding, stride = conv_fit(x.shape[1:3], kernel, stride)
             x = jnp.pad(x, ((0, 0), *padding, (0, 0)))
-            x = conv(x, weight.astype(dtype), stride) + bias.astype(dtype)
+            if i == 0:  # uint8 goes in as it is and the 1 / 255 onto the weights
+                x = image_conv(x, (weight * _BYTE).astype(dtype), stride)
+            else:
+                x = conv(x, weight.astype(dtype), stride)
+            x += bias.astype(dtype)
             if self.config.layer_norm:
                 axes = (-3, -2, -1)
                 norm = nn.LayerNorm(NORM_EPS, dtype, reduction_axes=axes, feature_axes=axes)
@@ -179,7 +185,7 @@ class PatchEncoder(nn.Module):
         x, dtype = raster, self.config.compute_dtype
         sizes = (self.config.patch_size, 2)
         # uint8 goes in as it is and the 1 / 255 onto the weights: one pass less over the image.
-        scales = (jnp.float32(1.0 / 255.0), jnp.float32(1.0))
+        scales = (_BYTE, np.float32(1.0))
         layers = zip(sizes, self.config.patch_features, scales, strict=True)
         for i, (size, features, scale) in enumerate(layers):
             weight, bias = _conv_params(self, i, (size, size, x.shape[-1], features))
