@@ -54,10 +54,18 @@ def test_rounded_progress_adds_up_to_the_whole_route():
 
 
 @pytest.mark.parametrize(
-    ("route_idx", "finished"), [(97, False), (98, True), (99, True)], ids=["2 left", "1", "0"]
+    ("route_idx", "num_points", "finished"),
+    [
+        (0, 100, False),
+        (97, 100, False),  # two points left
+        (98, 100, True),  # one
+        (99, 100, True),
+        (98, 101, False),  # the same place of a longer route
+        (0, 2, True),
+    ],
 )
-def test_finished_with_fewer_than_two_points_left(route_idx, finished):
-    got = route_completion.is_finished(jnp.int32(route_idx), jnp.int32(100))
+def test_finished_with_fewer_than_two_points_left(route_idx, num_points, finished):
+    got = route_completion.is_finished(jnp.int32(route_idx), jnp.int32(num_points))
     assert bool(got) is finished
 
 
