@@ -80,7 +80,7 @@ def write(rows: Sequence[Row], title: str, folder: Path) -> None:
     heads = ("", "seeds", "samples", *COLUMNS)
     lines = [f"# {title}", "", _line(heads), _line(["---"] * len(heads))]
     for row, (label, spread) in zip(rows, found, strict=True):
-        cells = [_text(name, *spread[name]) for name in COLUMNS]
+        cells = [_text(name, *spread[name], len(row.files)) for name in COLUMNS]
         lines.append(_line([label, str(len(row.files)), f"{row.num_samples:,}", *cells]))
     lines += ["", "Mean ± sample standard deviation over seeds, on carljax-36. DS, RC, clean: %;"]
     lines += ["the others per km."]
@@ -109,15 +109,15 @@ def show(rows: Sequence[Row], title: str, console: Console) -> None:
     for name in SHARES:
         shown.add_column(name, justify="right", no_wrap=True)
     for row, (label, spread) in zip(rows, table(rows), strict=True):
-        shown.add_row(
-            label, f"{row.num_samples:,}", *(_text(name, *spread[name]) for name in SHARES)
-        )
+        cells = [_text(name, *spread[name], len(row.files)) for name in SHARES]
+        shown.add_row(label, f"{row.num_samples:,}", *cells)
     console.print(shown, highlight=False)
 
 
-def _text(name: str, mean: float, std: float) -> str:
+def _text(name: str, mean: float, std: float, num_seeds: int) -> str:
+    """Returns a cell of the table; a single seed has no deviation."""
     digits = 1 if name in SHARES else 2
-    return f"{mean:.{digits}f} ± {std:.{digits}f}"
+    return f"{mean:.{digits}f}" + (f" ± {std:.{digits}f}" if num_seeds > 1 else "")
 
 
 def _line(cells: Sequence[str]) -> str:

@@ -8,6 +8,7 @@ import json
 import os
 import signal
 import types
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -127,16 +128,18 @@ def test_a_run_logs_its_own_samples_and_not_those_of_all(experiment):
         assert [line[SPEED] for line in lines] == [16.0, 16.0]
 
 
-def test_a_terminal_of_80_columns_shows_cells_and_scores(monkeypatch):
+@pytest.mark.parametrize(("num_seeds", "shown"), [(2, "31.2 ± 4.0"), (1, "31.2 ")])
+def test_a_terminal_of_80_columns_shows_cells_and_scores(monkeypatch, num_seeds, shown):
+    """With a deviation only where there are several seeds."""
     spread = {name: (31.25, 4.04) for name in experiment_report.COLUMNS}
     label = "Roach, minibatch 1024"
     monkeypatch.setattr(experiment_report, "table", lambda rows: [(label, spread)])
     console = Console(width=80, record=True, file=io.StringIO())
-    row = experiment_report.Row(label, "mean", 10_000_000, ())
+    row = experiment_report.Row(label, "mean", 10_000_000, (Path("a"),) * num_seeds)
     experiment_report.show([row], "A title", console)
     text = console.export_text()
-    assert label in text and "10,000,000" in text and text.count("31.2 ± 4.0") == 3
-    assert "…" not in text
+    assert label in text and "10,000,000" in text and text.count(shown) == 3
+    assert "…" not in text and ("±" in text) is (num_seeds > 1)
 
 
 def test_there_is_a_plot(experiment):

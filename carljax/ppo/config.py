@@ -78,7 +78,8 @@ class PPOConfig:
     """Decay of generalised advantage estimation."""
     bootstrap_truncated: bool = True
     """Value what would have followed an episode that ended without failure. The authors' code does
-    not: there every end is worth zero."""
+    not: there every end is worth zero. No matter for `carl` before episodes reach the time limit,
+    which none did in ten minutes of the preset `cpu` (docs/experiments.md)."""
     clip_coef: float = 0.1
     """Range of the probability ratio around 1."""
     clip_vloss: float | None = 0.1

@@ -32,7 +32,6 @@ GENTLE_BRAKING = 2.0  # m/s^2. source: ours
 ENTERED = 1.0  # m into the junction from which on a car will not wait at its entry. source: ours
 ACCEL = 1.5  # m/s^2 at which others, and the car itself, are taken to drive off. source: ours
 SLOWEST = 1.0  # m/s of others that are taken to go on. source: ours
-SETS_OFF = 2.0  # m/s of one that stands, for whose turn it is. source: ours
 MARGIN = 1.2  # s between two cars at one place. source: ours
 LEAST_MARGIN = 0.3  # s, after long waits. source: ours
 PATIENCE = 8.0  # s at rest after which nobody waits for a car that doesn't move. source: ours
@@ -52,8 +51,6 @@ class Crossers(struct.PyTreeNode):
       top_speed: m/s, no faster than that on it.
       half_length: m.
       wait_s: s at rest.
-      turn_s: s until it arrives, less what it has waited: of two, the lesser goes first.
-      slowness: s/m if it goes on as now.
       is_lawless: bool, drives and stops for nobody.
     """
 
@@ -63,8 +60,6 @@ class Crossers(struct.PyTreeNode):
     top_speed: jax.Array
     half_length: jax.Array
     wait_s: jax.Array
-    turn_s: jax.Array
-    slowness: jax.Array
     is_lawless: jax.Array
 
 
@@ -77,7 +72,6 @@ class Focus(struct.PyTreeNode):
       front: m of its front bumper, likewise.
       length: m, of that lane.
       top_speed: m/s on it.
-      turn_s: s, as of `Crossers`.
       can_wait: bool, is before it and on a lane on which there is room to wait.
     """
 
@@ -87,7 +81,6 @@ class Focus(struct.PyTreeNode):
     length: jax.Array
     can_wait: jax.Array
     top_speed: jax.Array
-    turn_s: jax.Array
 
 
 class Stretch(struct.PyTreeNode):
@@ -140,18 +133,14 @@ def crossers(agents: Agents, movers: Mover, road_map: RoadMap, top_speed: jax.Ar
     before = movers.s - road_map.lane_length[lane]
     after = movers.s + road_map.lane_length[jnp.maximum(past, 0)]
     bend = road_map.lane_curve_speed[jnp.maximum(way, 0)]
-    s = jnp.where(is_in, movers.s, jnp.where(is_out, after, before))
-    wait_s = jnp.append(agents.wait_s, 0.0)
     # The ego may be as fast as it likes.
     return Crossers(
         lane=way,
-        s=s,
+        s=jnp.where(is_in, movers.s, jnp.where(is_out, after, before)),
         speed=movers.speed,
         top_speed=jnp.minimum(jnp.append(top_speed, 40.0), 1.2 * bend),
         half_length=movers.half_length,
-        wait_s=wait_s,
-        turn_s=_turn(s + movers.half_length, movers.speed, wait_s),
-        slowness=1.0 / jnp.maximum(movers.speed, SLOWEST),
+        wait_s=jnp.append(agents.wait_s, 0.0),
         # One that stands in a queue will not come: to wait for it could be to wait for ever.
         is_lawless=jnp.append(agents.is_lawless, False) & ~movers.is_queued,
     )
@@ -182,13 +171,7 @@ def focus_of(agents: Agents, road_map: RoadMap, top_speed: jax.Array) -> Focus:
         length=pick(plan.length),
         can_wait=looks_on & ~is_in & (plan.length[:, 0] > SHORT),
         top_speed=jnp.minimum(top_speed, road_map.lane_curve_speed[lane]),
-        turn_s=_turn(s + half, agents.speed, agents.wait_s),
     )
-
-
-def _turn(front: jax.Array, speed: jax.Array, wait_s: jax.Array) -> jax.Array:
-    """Seconds until a front, m past a junction's entry, arrives there, less those at rest."""
-    return jnp.maximum(-front, 0.0) / jnp.maximum(speed, SETS_OFF) - wait_s
 
 
 def pairs(agents: Agents, focus: Focus, others: Crossers, road_map: RoadMap) -> Pairs:
@@ -301,7 +284,7 @@ def gated(pair: Pairs, may_go: jax.Array) -> jax.Array:
     )
     stands = (pair.wait_s > PATIENCE) & (others.speed < 0.5) & ~others.is_lawless
     inside = has_entered & (others.s - others.half_length < theirs.leave) & ~_joins(pair)
-    inside &= (_to_go(pair) < _way_until_left(pair, 0.5 * MARGIN)) & (there | ~stands)
+    inside &= (_leaves(pair) + 0.5 * MARGIN > _arrives(pair)) & (there | ~stands)
     margin = jnp.clip(MARGIN * PATIENCE / (PATIENCE + pair.wait_s), LEAST_MARGIN, MARGIN)
     yields = (pair.owes == CONFLICT_YIELD) | others.is_lawless
     yields |= (pair.owes == CONFLICT) & _is_earlier(pair, order)
@@ -312,48 +295,40 @@ def gated(pair: Pairs, may_go: jax.Array) -> jax.Array:
 
 def _is_earlier(pair: Pairs, order: jax.Array) -> jax.Array:
     """The other car arrives, or has arrived, before the agent."""
-    mine, other = pair.focus.turn_s, pair.others.turn_s
+    focus, others = pair.focus, pair.others
+    mine = jnp.maximum(-focus.front, 0.0) / jnp.maximum(pair.speed, 2.0) - pair.wait_s
+    other = jnp.maximum(-others.s - others.half_length, 0.0) / jnp.maximum(others.speed, 2.0)
+    other = other - others.wait_s
     mine_order = order[: mine.shape[0], None]
     return (other < mine) | ((other == mine) & (order < mine_order))
 
 
 def _collides(pair: Pairs, margin: jax.Array | float) -> jax.Array:
-    """An agent that goes now and another would be on their stretches within a margin of time.
-
-    Asked is how far each comes until the other has left its stretch, and not when each arrives,
-    which would take a root and a division more for every pair.
-    """
+    """An agent that goes now and another would be on their stretches within a margin of time."""
     theirs, focus, others = pair.theirs, pair.focus, pair.others
+    theirs_in = _time(theirs.enter - others.s - others.half_length, others.speed, others.top_speed)
     out = pair.mine.leave - focus.s + pair.half_length
     # A car that ends on one lane with the other only has to be ahead of it.
     out = jnp.where(pair.merges, out + FOLLOWS * others.speed, out)
     mine_out = _time(out, pair.speed, focus.top_speed)
-    theirs_to_go = theirs.enter - others.s - others.half_length
-    theirs_way = _way(mine_out + margin, others.speed, others.top_speed)
-    return (_to_go(pair) < _way_until_left(pair, margin)) & (theirs_to_go < theirs_way)
+    return (_arrives(pair) < _leaves(pair) + margin) & (theirs_in < mine_out + margin)
 
 
-def _to_go(pair: Pairs) -> jax.Array:
-    """(N, M) m until an agent's front comes to the stretch; negative once it has."""
-    return pair.mine.enter - pair.focus.front
+def _arrives(pair: Pairs) -> jax.Array:
+    """(N, M) s until an agent comes to the stretch."""
+    to_go = pair.mine.enter - pair.focus.front
+    return _time(to_go, pair.speed, pair.focus.top_speed)
 
 
-def _way_until_left(pair: Pairs, margin: jax.Array | float) -> jax.Array:
-    """(N, M) m that an agent comes till so long after the other car has left if it goes on so."""
+def _leaves(pair: Pairs) -> jax.Array:
+    """(N, M) s until the other car has left the stretch if it goes on as now."""
     others = pair.others
     left = pair.theirs.leave - others.s + others.half_length
-    seconds = jnp.maximum(left, 0.0) * others.slowness
-    return _way(seconds + margin, pair.speed, pair.focus.top_speed)
-
-
-def _way(seconds: jax.Array, speed: jax.Array, top_speed: jax.Array) -> jax.Array:
-    """Metres in a time: with ACCEL from a speed, no faster than another."""
-    free = (speed + 0.5 * ACCEL * seconds) * seconds
-    return jnp.minimum(free, jnp.maximum(top_speed, SLOWEST) * seconds)
+    return jnp.maximum(left, 0.0) / jnp.maximum(others.speed, SLOWEST)
 
 
 def _time(distance: jax.Array, speed: jax.Array, top_speed: jax.Array) -> jax.Array:
-    """Seconds for a distance, the inverse of `_way`; 0 for none."""
+    """Seconds for a distance: with ACCEL from a speed, no faster than another."""
     distance = jnp.maximum(distance, 0.0)
     free = (jnp.sqrt(speed**2 + 2 * ACCEL * distance) - speed) / ACCEL
     return jnp.maximum(free, distance / jnp.maximum(top_speed, SLOWEST))

@@ -85,19 +85,6 @@ def test_what_is_looked_up_is_what_the_host_found(world, pair):
         assert 0 <= stretch.leave[0, 1] - found.leave[place] < 0.25
 
 
-def test_way_and_time_are_each_other_s_inverse():
-    """So "arrives before" may be asked as "comes as far by then"."""
-    rng = np.random.default_rng(0)
-    way, speed = rng.uniform(0.1, 60, 500), rng.uniform(0, 15, 500)
-    top = rng.uniform(0.5, 15, 500)  # m/s; slower than the car is already in some
-    # Written apart: at 1.5 m/s^2, or at the top speed, of 1 m/s at least, if that is later.
-    free = (-speed + np.sqrt(speed**2 + 3.0 * way)) / 1.5
-    seconds = np.maximum(free, way / np.maximum(top, 1.0))
-    np.testing.assert_allclose(priority._time(f32(way), f32(speed), f32(top)), seconds, rtol=1e-4)
-    np.testing.assert_allclose(priority._way(f32(seconds), f32(speed), f32(top)), way, rtol=1e-4)
-    assert float(priority._time(f32(-3.0), f32(5.0), f32(9.0))) == 0.0
-
-
 def test_follows_on_the_lane_beside_until_they_have_parted(world):
     straight, left = (world.way("plain", "east", way)[1:] for way in ("straight", "left"))
     for ahead, gap in ((7.0, 7.0 - 3.0 - 4.0), (15.0, 1000.0)):
