@@ -4,8 +4,8 @@ It takes most of the time of the paper's networks on a CPU, since a product of m
 columns is slow. So a CPU gets one with more of them: the image is read in blocks of columns, and
 from two neighbouring blocks some neighbouring outputs are made at once, by a kernel that holds the
 weights once for each. At 5 x 5, stride 2, three eighths are zeros, multiplied in vain, and still
-value and weight gradient take about two thirds of the time. GPUs and TPUs get the plain
-convolution.
+value and weight gradient together take half to three fifths of the time (10 channels, 64 to 128
+px, two cores), the value alone 0.8 to 0.93 of it. GPUs and TPUs get the plain convolution.
 """
 
 from __future__ import annotations
