@@ -27,6 +27,7 @@ from carljax.sim import (
     route,
     situation,
     spawn,
+    threefry,
     traffic,
 )
 from carljax.sim.bicycle import VehicleParams
@@ -170,9 +171,9 @@ class DrivingEnv(struct.PyTreeNode):
 
     def start(self, key: jax.Array) -> State:
         """Returns what `reset` does, without the observation."""
-        key_episode, key = jax.random.split(key)
+        key_episode, key_rest = jax.random.split(threefry.written_out(key))
         episode_idx = jax.random.randint(key_episode, (), 0, self.bank.num_episodes)
-        return self.start_episode(episode_idx, key)
+        return self.start_episode(episode_idx, threefry.like(key_rest, key))
 
     def start_episode(self, episode_idx: jax.Array, key: jax.Array) -> State:
         """Returns the first state of a given episode, without the observation.
@@ -181,7 +182,7 @@ class DrivingEnv(struct.PyTreeNode):
           episode_idx: () int32, row of the bank.
           key: PRNG key, of all that the bank leaves open.
         """
-        key_light, key_scenarios, key = jax.random.split(key, 3)
+        key_light, key_scenarios, key_next = jax.random.split(threefry.written_out(key), 3)
         routes, zero_idx = self.bank.routes, jnp.zeros((), jnp.int32)
         ego = ego_at(routes.xy[episode_idx, 0], routes.z[episode_idx], routes.yaw[episode_idx, 0])
         place = EgoPlace(routes.lane[episode_idx, 0], zero_idx - 1, routes.lane_s[episode_idx, 0])
@@ -206,7 +207,7 @@ class DrivingEnv(struct.PyTreeNode):
                 self.config.num_scenario_slots,
             ),
             step_count=zero_idx,
-            key=key,
+            key=threefry.like(key_next, key),
         )
         zero = jnp.zeros((), jnp.float32)
         return State(
@@ -221,7 +222,8 @@ class DrivingEnv(struct.PyTreeNode):
     def advance(self, state: State, action: jax.Array) -> State:
         """Returns what `step` does, without the observation."""
         before = state.pipeline_state
-        key, key_traffic, key_respawn, key_scenarios, key_walk = jax.random.split(before.key, 5)
+        keys = jax.random.split(threefry.written_out(before.key), 5)
+        key_next, key_traffic, key_respawn, key_scenarios, key_walk = keys
         dt, road_map = self.config.dt, self.bank.road_map
         stretch, first = route.window(self.bank.routes, before.episode_idx, before.route_idx)
         idx = before.route_idx - first
@@ -287,7 +289,7 @@ class DrivingEnv(struct.PyTreeNode):
             scenarios=slots,
             lights=clock,
             step_count=before.step_count + 1,
-            key=key,
+            key=threefry.like(key_next, before.key),
         )
         ended, truncated = reward.ending(terminated, terms, self.reward_config)
         return State(
