@@ -7,6 +7,7 @@ import jax.numpy as jnp
 from flax import struct
 
 from carljax.sim import geometry
+from carljax.sim.once import once
 from carljax.sim.road_map import WALK_CROSSING, WALK_JAYWALK, RoadMap
 from carljax.sim.types import KIND_VEHICLE, Agents, EgoState, Walkers
 
@@ -75,6 +76,47 @@ class Meeting(struct.PyTreeNode):
     blocks: jax.Array
 
 
+class Cars(struct.PyTreeNode):
+    """The vehicles that pedestrians look at, all (V + 1,); the ego is the last.
+
+    Attributes:
+      exists: bool, it is one.
+      x, y, z: m.
+      cos, sin: of the direction in which it drives.
+      speed: m/s.
+      stops_in: m, if it goes on to brake as it does.
+      half_length, half_width: m.
+    """
+
+    exists: jax.Array
+    x: jax.Array
+    y: jax.Array
+    z: jax.Array
+    cos: jax.Array
+    sin: jax.Array
+    speed: jax.Array
+    stops_in: jax.Array
+    half_length: jax.Array
+    half_width: jax.Array
+
+
+class Ways(struct.PyTreeNode):
+    """Where pedestrians are and go, all (W,).
+
+    Attributes:
+      x, y, z: m.
+      cos, sin: of the direction of their edge.
+      left: m to the end of it.
+    """
+
+    x: jax.Array
+    y: jax.Array
+    z: jax.Array
+    cos: jax.Array
+    sin: jax.Array
+    left: jax.Array
+
+
 def edge_of(bodies: Agents, walkers: Walkers, road_map: RoadMap) -> Edge:
     """Looks up the edges that pedestrians (W,) walk on."""
     target = jnp.maximum(walkers.target, 0)
@@ -140,39 +182,62 @@ def meetings(
     bodies: Agents, edge: Edge, others: Agents, ego: EgoState, ego_size: jax.Array
 ) -> Meeting:
     """What pedestrians see of the vehicles; see `must_wait`."""
-    speed = jnp.append(others.speed, ego.speed)
-    half_length = 0.5 * jnp.append(others.length, ego_size[0])
-    half_width = 0.5 * jnp.append(others.width, ego_size[1])
-    level = abs(jnp.append(others.z, ego.z) - bodies.z[:, None]) < MAX_STEP_Z
-    exists = jnp.append(others.kind == KIND_VEHICLE, True) & level  # (W, V + 1)
+    cars = once(_cars(others, ego, ego_size))
+    way = jax.tree.map(lambda x: x[:, None], once(_ways(bodies, edge)))
+    exists = cars.exists & (jnp.abs(cars.z - way.z) < MAX_STEP_Z)  # (W, V + 1)
     # In the frame of the pedestrian: x along its edge, y to its left.
-    xy = jnp.concatenate([others.xy, ego.xy[None]])
-    turned = jnp.append(others.yaw, ego.yaw + ego.slip) - edge.yaw[:, None]
-    at = geometry.to_frame(xy[None], bodies.xy[:, None], edge.yaw[:, None])
-    x, y = at[..., 0], at[..., 1]
-    to_x, to_y = jnp.cos(turned), jnp.sin(turned)
-    front = x - half_length * abs(to_x) - half_width * abs(to_y)
-    side = abs(y) - half_length * abs(to_y) - half_width * abs(to_x)
+    off_x, off_y = cars.x - way.x, cars.y - way.y
+    x, y = way.cos * off_x + way.sin * off_y, way.cos * off_y - way.sin * off_x
+    to_x, to_y = way.cos * cars.cos + way.sin * cars.sin, way.cos * cars.sin - way.sin * cars.cos
+    front = x - cars.half_length * jnp.abs(to_x) - cars.half_width * jnp.abs(to_y)
+    side = jnp.abs(y) - cars.half_length * jnp.abs(to_y) - cars.half_width * jnp.abs(to_x)
     # The nearest place that is still to be walked, as the vehicle sees it.
-    still = jnp.maximum(edge.length - edge.along, 0.0)[:, None]
-    off_x = jnp.clip(x, 0.0, still) - x
+    off_x = jnp.clip(x, 0.0, way.left) - x
     forward = off_x * to_x - y * to_y
-    across = abs(off_x * to_y + y * to_x)
-    distance = jnp.maximum(jnp.sqrt(off_x**2 + y**2) - half_length, 0.0)
-    braking = jnp.maximum(-jnp.append(others.accel, ego.accel), 0.1)
-    stops_short = speed**2 / (2 * braking) < distance - STOPS_SHORT
+    across = jnp.abs(off_x * to_y + y * to_x)
+    distance = jnp.maximum(jnp.sqrt(off_x**2 + y**2) - cars.half_length, 0.0)
+    stops_short = cars.stops_in < distance - STOPS_SHORT
     # Where their ways meet if it keeps its lane, or else its direction: the later of the two.
-    straight = x + abs(y) * to_x / jnp.maximum(abs(to_y), 0.2)
-    meet = jnp.clip(jnp.maximum(x, straight), 0.0, still)
+    straight = x + jnp.abs(y) * to_x / jnp.maximum(jnp.abs(to_y), 0.2)
+    meet = jnp.clip(jnp.maximum(x, straight), 0.0, way.left)
     return Meeting(
         comes=exists
-        & (speed > ROLLING)
+        & (cars.speed > ROLLING)
         & ~stops_short
         & (forward > 0.0)
         & (across < CONE_SIDE + CONE_SLOPE * forward),
         distance=distance,
-        speed=jnp.broadcast_to(speed, x.shape),
-        enter=meet - half_width - BESIDE,
-        leave=meet + half_width + BESIDE,
+        speed=jnp.broadcast_to(cars.speed, x.shape),
+        enter=meet - cars.half_width - BESIDE,
+        leave=meet + cars.half_width + BESIDE,
         blocks=exists & (x > 0.0) & (front < IN_FRONT) & (side < 0.5 * SIZE),
+    )
+
+
+def _cars(others: Agents, ego: EgoState, ego_size: jax.Array) -> Cars:
+    yaw = jnp.append(others.yaw, ego.yaw + ego.slip)
+    speed = jnp.append(others.speed, ego.speed)
+    braking = jnp.maximum(-jnp.append(others.accel, ego.accel), 0.1)
+    return Cars(
+        exists=jnp.append(others.kind == KIND_VEHICLE, True),
+        x=jnp.append(others.xy[:, 0], ego.xy[0]),
+        y=jnp.append(others.xy[:, 1], ego.xy[1]),
+        z=jnp.append(others.z, ego.z),
+        cos=jnp.cos(yaw),
+        sin=jnp.sin(yaw),
+        speed=speed,
+        stops_in=speed**2 / (2 * braking),
+        half_length=0.5 * jnp.append(others.length, ego_size[0]),
+        half_width=0.5 * jnp.append(others.width, ego_size[1]),
+    )
+
+
+def _ways(bodies: Agents, edge: Edge) -> Ways:
+    return Ways(
+        x=bodies.xy[:, 0],
+        y=bodies.xy[:, 1],
+        z=bodies.z,
+        cos=jnp.cos(edge.yaw),
+        sin=jnp.sin(edge.yaw),
+        left=jnp.maximum(edge.length - edge.along, 0.0),
     )

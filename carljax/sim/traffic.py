@@ -21,6 +21,7 @@ from carljax.sim import (
 )
 from carljax.sim.idm import IDMParams
 from carljax.sim.lane_plan import next_lane, plan
+from carljax.sim.once import once
 from carljax.sim.right_of_way import (
     FAR,
     EgoPlace,
@@ -69,8 +70,9 @@ def step(
     seen = corridor.obstacles(others, ego, ego_length)
     free = drivers.free_speed(agents, road_map)
     accel = drivers.accelerations(agents, free, stop, movers, seen, road_map, params)
+    accel, free_speed = once((accel, free.speed))
     key_change, key_plan = jax.random.split(key)
-    agents = lane_change.begin(agents, movers, free.speed, road_map, params, key_change)
+    agents = lane_change.begin(agents, movers, free_speed, road_map, params, key_change)
     speed = jnp.maximum(agents.speed + accel * dt, 0.0)
     travelled = 0.5 * (agents.speed + speed) * dt
     moved = agents.replace(
