@@ -66,7 +66,7 @@ def obstacles(others: Agents, ego: EgoState, ego_length: jax.Array) -> Obstacles
 
 
 class Piece(struct.PyTreeNode):
-    """A straight piece of an agent's way, (N, P).
+    """A straight piece of an agent's way, (P, N).
 
     Attributes:
       x, y: m, where it begins.
@@ -99,9 +99,9 @@ def gaps(agents: Agents, seen: Obstacles, road_map: RoadMap) -> tuple[jax.Array,
     Returns:
       (N,) m between bumper and obstacle, FAR where there is none; (N,) m/s.
     """
-    # Numbers for one of a pair are all made before those for pairs, of which there are N P F.
-    way = jax.tree.map(lambda x: x[..., None], once(_pieces(agents, road_map)))
-    seen = once(seen)
+    # Numbers for one of a pair are all made before those for pairs, of which there are F P N.
+    way = once(_pieces(agents, road_map))
+    seen = jax.tree.map(lambda x: x[:, None, None], once(seen))
     x, y = seen.x - way.x, seen.y - way.y
     ahead, left = way.cos * x + way.sin * y, way.cos * y - way.sin * x
     cos, sin = way.cos * seen.cos + way.sin * seen.sin, way.cos * seen.sin - way.sin * seen.cos
@@ -113,16 +113,16 @@ def gaps(agents: Agents, seen: Obstacles, road_map: RoadMap) -> tuple[jax.Array,
         return jnp.where(in_way, ahead, FAR)
 
     now, then = near(ahead, left), near(ahead + seen.moves * cos, left + seen.moves * sin)
-    gap = jnp.minimum(now, then) - along  # (N, P, F)
+    gap = jnp.minimum(now, then) - along  # (F, P, N)
     gap, speed = _nearest(gap, seen.speed * jnp.maximum(cos, 0.0))
-    gap, speed = _nearest(gap + way.gap[..., 0], speed)
+    gap, speed = _nearest(gap + way.gap, speed)
     return jnp.where(gap < 0.5 * FAR, gap, FAR), jnp.where(gap < 0.5 * FAR, speed, 0.0)
 
 
 def _nearest(gap: jax.Array, speed: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Returns the smallest gap of the last axis and its speed, the highest of equals."""
-    nearest = gap.min(axis=-1)
-    return nearest, jnp.where(gap == nearest[..., None], speed, 0.0).max(axis=-1)
+    """Returns the smallest gap of the first axis and its speed, the highest of equals."""
+    nearest = gap.min(axis=0)
+    return nearest, jnp.where(gap == nearest, speed, 0.0).max(axis=0)
 
 
 def _pieces(agents: Agents, road_map: RoadMap) -> Piece:
@@ -132,7 +132,7 @@ def _pieces(agents: Agents, road_map: RoadMap) -> Piece:
     length = jnp.sqrt(jnp.maximum((piece**2).sum(axis=-1), 1e-6))
     along = along[:, :-1]
     size = agents.length[:, None]
-    return Piece(
+    pieces = Piece(
         x=points[:, :-1, 0],
         y=points[:, :-1, 1],
         cos=piece[..., 0] / length,
@@ -142,6 +142,7 @@ def _pieces(agents: Agents, road_map: RoadMap) -> Piece:
         half_width=jnp.broadcast_to(0.5 * agents.width[:, None] + SIDE, along.shape),
         gap=along - 0.5 * size,
     )
+    return jax.tree.map(jnp.transpose, pieces)
 
 
 def _way(agents: Agents, road_map: RoadMap) -> tuple[jax.Array, jax.Array]:

@@ -94,7 +94,7 @@ def accelerations(
 
 def _is_in_queue(along: jax.Array, movers: Mover) -> jax.Array:
     """(N,) bool, stands behind one that stands: to let it go first could be to wait for ever."""
-    to_queue = jnp.where(movers.is_queued, along, FAR).min(axis=1)
+    to_queue = jnp.where(movers.is_queued[:, None], along, FAR).min(axis=0)
     return movers.is_queued[:-1] & (to_queue < QUEUE_GAP)
 
 
@@ -123,21 +123,20 @@ def free_speed(agents: Agents, road_map: RoadMap) -> Free:
 
 
 def lane_gaps(agents: Agents, movers: Mover, road_map: RoadMap) -> jax.Array:
-    """(N, M) m, bumper gap to every car ahead on an agent's plan; FAR to all others.
+    """(M, N) m, bumper gap to every car ahead on an agent's plan; FAR to all others.
 
     Args:
       agents: (N,) vehicles.
       movers: (M,) everybody, the ego last.
       road_map: the map.
     """
-    lanes = agents.lanes[:, :, None]  # (N, 3, 1)
-    begin = ahead_of(agents, road_map).begin[:, :, None]
-    other, other_s = movers.lane[None, :], movers.s[None, :]  # (1, M)
-    ahead = other_s + begin[:, 0]
-    gap = jnp.where((other == lanes[:, 0]) & (ahead > 0.0), ahead, FAR)
-    gap = jnp.minimum(gap, jnp.where(other == lanes[:, 1], other_s + begin[:, 1], FAR))
-    gap = jnp.minimum(gap, jnp.where(other == lanes[:, 2], other_s + begin[:, 2], FAR))
-    room = movers.half_length[None, :] + 0.5 * agents.length[:, None]
+    lanes, begin = once((list(agents.lanes.T), list(ahead_of(agents, road_map).begin.T)))
+    other, other_s = movers.lane[:, None], movers.s[:, None]
+    ahead = other_s + begin[0]
+    gap = jnp.where((other == lanes[0]) & (ahead > 0.0), ahead, FAR)
+    gap = jnp.minimum(gap, jnp.where(other == lanes[1], other_s + begin[1], FAR))
+    gap = jnp.minimum(gap, jnp.where(other == lanes[2], other_s + begin[2], FAR))
+    room = movers.half_length[:, None] + 0.5 * agents.length
     return jnp.where((other >= 0) & (gap < FAR), gap - room, FAR)
 
 
@@ -145,9 +144,9 @@ def leaders(gaps: jax.Array, movers: Mover) -> tuple[jax.Array, jax.Array]:
     """Bumper gap to, and speed of, the nearest car ahead: (N,) m, (N,) m/s.
 
     Args:
-      gaps: (N, M) m to everybody.
+      gaps: (M, N) m to everybody.
       movers: (M,) everybody.
     """
-    nearest = gaps.min(axis=1)
+    nearest = gaps.min(axis=0)
     # No search by index, which would cost more than all of the above.
-    return nearest, jnp.where(gaps == nearest[:, None], movers.speed, 0.0).max(axis=1)
+    return nearest, jnp.where(gaps == nearest, movers.speed[:, None], 0.0).max(axis=0)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 from flax import struct
@@ -79,40 +81,42 @@ def gaps(
       everybody: see `Others`.
       road_map: the map.
     """
-    movers = everybody.mover
-    is_other = jnp.arange(movers.lane.shape[0]) != itself[:, None]
-    lane, other_s = jnp.where(is_other, movers.lane[None, :], -1), movers.s[None, :]
-    to_next = (road_map.lane_length[jnp.maximum(lanes[:, 0], 0)] - s)[:, None]
-    to_third = to_next + road_map.lane_length[jnp.maximum(lanes[:, 1], 0)][:, None]
-    on_first = (lane == lanes[:, :1]) & (lane >= 0)
-    on_next = (lane == lanes[:, 1:2]) & (lane >= 0)
-    on_third = (lane == lanes[:, 2:]) & (lane >= 0)
-    offset = other_s - s[:, None]
+    movers = jax.tree.map(lambda x: x[:, None], everybody.mover)
+    first, following, third = lanes.T
+    is_other = jnp.arange(movers.lane.shape[0])[:, None] != itself
+    lane = jnp.where(is_other, movers.lane, -1)  # (everybody, M)
+    to_next = road_map.lane_length[jnp.maximum(first, 0)] - s
+    to_third = to_next + road_map.lane_length[jnp.maximum(following, 0)]
+    on_first = (lane == first) & (lane >= 0)
+    on_next = (lane == following) & (lane >= 0)
+    on_third = (lane == third) & (lane >= 0)
+    offset = movers.s - s
     ahead = jnp.where(on_first & (offset > 0.0), offset, FAR)
-    ahead = jnp.minimum(ahead, jnp.where(on_next, to_next + other_s, FAR))
-    ahead = jnp.minimum(ahead, jnp.where(on_third, to_third + other_s, FAR))
+    ahead = jnp.minimum(ahead, jnp.where(on_next, to_next + movers.s, FAR))
+    ahead = jnp.minimum(ahead, jnp.where(on_third, to_third + movers.s, FAR))
     # From the middle of the place to that of whoever drives up to it.
-    arrives = (movers.next_lane[None, :] == lanes[:, :1]) & (lane >= 0)
-    until = s[:, None] + movers.entry[None, :] + movers.half_length[None, :]
+    arrives = (movers.next_lane == first) & (lane >= 0)
+    until = s + movers.entry + movers.half_length
     behind = jnp.where(on_first & (offset <= 0.0), -offset, jnp.where(arrives, until, FAR))
-    half = 0.5 * length[:, None] + movers.half_length[None, :]
+    half = 0.5 * length + movers.half_length
     ahead, behind = ahead - half, behind - half
-    nearest, last = ahead.min(axis=1), behind.min(axis=1)
+    nearest, last = ahead.min(axis=0), behind.min(axis=0)
 
     # Of whoever is nearest: no search by index, which costs more than all the rest.
-    def of(is_it: jax.Array, values: jax.Array | float) -> jax.Array:
-        return jnp.where(is_it, values, 0.0).max(axis=1)
+    def of(is_it: jax.Array, values: Any) -> jax.Array:
+        return jnp.where(is_it, values[:, None], 0.0).max(axis=0)
 
-    leads, comes = ahead == nearest[:, None], behind == last[:, None]
+    leads, comes = ahead == nearest, behind == last
+    speed, driver = everybody.mover.speed, everybody.driver
     return Gaps(
         ahead=jnp.where(nearest < 0.5 * FAR, nearest, jnp.inf),
         behind=jnp.where(last < 0.5 * FAR, last, jnp.inf),
-        leader_speed=of(leads, movers.speed),
-        follower_speed=of(comes, movers.speed),
+        leader_speed=of(leads, speed),
+        follower_speed=of(comes, speed),
         follower_desired=of(comes, everybody.desired),
-        follower=everybody.driver.replace(
-            accel_max=of(comes, everybody.driver.accel_max),
-            comfort_brake=of(comes, everybody.driver.comfort_brake),
+        follower=driver.replace(
+            accel_max=of(comes, driver.accel_max),
+            comfort_brake=of(comes, driver.comfort_brake),
         ),
     )
 

@@ -88,23 +88,24 @@ def leaders(agents: Agents, movers: Mover, road_map: RoadMap) -> tuple[jax.Array
     """
     row, is_used = changing(agents)
     half = 0.5 * agents.length
-    # Everybody behind those who leave: (N, AT_ONCE).
-    left, left_s = jnp.where(is_used, agents.from_lane[row], -2), agents.from_s[row]
+    # Everybody behind those who leave: (AT_ONCE, N).
+    left = jnp.where(is_used, agents.from_lane[row], -2)[:, None]
+    left_s, left_half = agents.from_s[row][:, None], half[row][:, None]
+    on_first, on_next = agents.lanes[:, 0] == left, agents.lanes[:, 1] == left
     to_next = road_map.lane_length[jnp.maximum(agents.lanes[:, 0], 0)] - agents.lane_s
-    offset = left_s - agents.lane_s[:, None]
-    ahead = jnp.where((agents.lanes[:, :1] == left) & (offset > 0.0), offset, FAR)
-    on_next = agents.lanes[:, 1:2] == left
-    ahead = jnp.minimum(ahead, jnp.where(on_next, to_next[:, None] + left_s, FAR))
-    ahead = ahead - half[:, None] - half[row]
-    # Those who leave behind everybody, others who leave the same lane too: (AT_ONCE, N + ...).
-    seen = with_leaving(movers, agents)
-    offset = seen.s - left_s[:, None]
-    gap = jnp.where((seen.lane == left[:, None]) & (offset > 0.0), offset, FAR)
-    gap = gap - half[row][:, None] - seen.half_length
-    nearest = gap.min(axis=1)
-    speed = jnp.where(gap == nearest[:, None], seen.speed, 0.0).max(axis=1)
-    is_mine = (jnp.arange(agents.lane_s.shape[0])[:, None] == row) & is_used  # (N, AT_ONCE)
-    both = jnp.concatenate([ahead, jnp.where(is_mine, nearest, FAR)], axis=1)
-    speeds = jnp.concatenate([agents.speed[row], speed])
-    least = both.min(axis=1)
-    return least, jnp.where(both == least[:, None], speeds, 0.0).max(axis=1)
+    offset = left_s - agents.lane_s
+    ahead = jnp.where(on_first & (offset > 0.0), offset, FAR)
+    ahead = jnp.minimum(ahead, jnp.where(on_next, to_next + left_s, FAR))
+    ahead = ahead - half - left_half
+    # Those who leave behind everybody, others who leave the same lane too: (N + ..., AT_ONCE).
+    seen = jax.tree.map(lambda x: x[:, None], with_leaving(movers, agents))
+    offset = seen.s - left_s[:, 0]
+    gap = jnp.where((seen.lane == left[:, 0]) & (offset > 0.0), offset, FAR)
+    gap = gap - half[row] - seen.half_length
+    nearest = gap.min(axis=0)
+    speed = jnp.where(gap == nearest, seen.speed, 0.0).max(axis=0)
+    is_mine = (jnp.arange(agents.lane_s.shape[0]) == row[:, None]) & is_used[:, None]
+    both = jnp.concatenate([ahead, jnp.where(is_mine, nearest[:, None], FAR)])  # (2 AT_ONCE, N)
+    speeds = jnp.concatenate([agents.speed[row], speed])[:, None]
+    least = both.min(axis=0)
+    return least, jnp.where(both == least, speeds, 0.0).max(axis=0)

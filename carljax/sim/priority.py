@@ -91,15 +91,18 @@ class Stretch(struct.PyTreeNode):
 
 
 class Pairs(struct.PyTreeNode):
-    """Every agent's focus (rows) against every crosser (columns), (N, M).
+    """Every crosser (rows) against every agent's focus (columns), (M, N).
+
+    The agents come last since a CPU computes along the last axis, and what is looked for among the
+    others of each is then found for many agents at once.
 
     Attributes:
       owes: int32, FREE or one of the CONFLICT codes of `junctions`.
       merges, forks: bool, the lanes end, begin together.
       mine, theirs: the stretches on the lanes of both.
-      focus: (N, 1) of each agent.
-      others: (1, M) crossers.
-      speed, wait_s, half_length: (N, 1) of each agent.
+      focus: (N,) of each agent.
+      others: (M, 1) crossers.
+      speed, wait_s, half_length: (N,) of each agent.
     """
 
     owes: jax.Array
@@ -182,10 +185,10 @@ def pairs(agents: Agents, focus: Focus, others: Crossers, road_map: RoadMap) -> 
     # A product of matrices that picks single numbers, exactly; a look-up for each pair within what
     # follows would keep the compiler from vectorising all of it on a CPU.
     found = jnp.einsum(
-        "ncj,mj->cnm", road_map.lane_meeting[row], is_slot, precision=jax.lax.Precision.HIGHEST
+        "mj,ncj->cmn", is_slot, road_map.lane_meeting[row], precision=jax.lax.Precision.HIGHEST
     )
-    same = road_map.lane_junction[row][:, None] == road_map.lane_junction[seen][None, :]
-    same &= (focus.lane >= 0)[:, None] & (others.lane >= 0)[None, :]
+    same = road_map.lane_junction[seen][:, None] == road_map.lane_junction[row]
+    same &= (others.lane >= 0)[:, None] & (focus.lane >= 0)
     mine, theirs = jnp.where(same, found.astype(jnp.int32), 0)
     relation = (mine >> 2) & 3
     return Pairs(
@@ -194,11 +197,11 @@ def pairs(agents: Agents, focus: Focus, others: Crossers, road_map: RoadMap) -> 
         forks=(relation & FORK) > 0,
         mine=_stretch((mine >> 4) & MEETING_MASK, mine >> 14),
         theirs=_stretch(theirs & 0xFFF, theirs >> 12),
-        focus=jax.tree.map(lambda x: x[:, None], focus),
-        others=jax.tree.map(lambda x: x[None, :], others),
-        speed=agents.speed[:, None],
-        wait_s=agents.wait_s[:, None],
-        half_length=0.5 * agents.length[:, None],
+        focus=focus,
+        others=jax.tree.map(lambda x: x[:, None], others),
+        speed=agents.speed,
+        wait_s=agents.wait_s,
+        half_length=0.5 * agents.length,
     )
 
 
@@ -208,7 +211,7 @@ def _stretch(enter: jax.Array, leave: jax.Array) -> Stretch:
 
 
 def joined_gaps(pair: Pairs) -> jax.Array:
-    """(N, M) m, bumper gap to cars on lanes that begin or end with an agent's own, FAR elsewhere.
+    """(M, N) m, bumper gap to cars on lanes that begin or end with an agent's own, FAR elsewhere.
 
     Where lanes part, to the one ahead until its tail is clear; where they join, to the one that is
     nearer to where they end.
@@ -242,7 +245,7 @@ def stretch_gaps(pair: Pairs) -> jax.Array:
     there |= others.is_lawless & _collides(pair, MARGIN)
     there &= others.s - others.half_length < theirs.leave
     blocked = crosses & there & (focus.front < pair.mine.enter)
-    return jnp.where(blocked, pair.mine.enter - focus.front, FAR).min(axis=1)
+    return jnp.where(blocked, pair.mine.enter - focus.front, FAR).min(axis=0)
 
 
 def has_room(focus: Focus, half_length: jax.Array, gaps: jax.Array, movers: Mover) -> jax.Array:
@@ -255,12 +258,12 @@ def has_room(focus: Focus, half_length: jax.Array, gaps: jax.Array, movers: Move
     Args:
       focus: of each agent.
       half_length: (N,) m.
-      gaps: (N, M) m to cars ahead on its plan, FAR to others.
+      gaps: (M, N) m to cars ahead on its plan, FAR to others.
       movers: (M,) everybody.
     """
-    to_queue = jnp.where(movers.is_queued, gaps, FAR).min(axis=1)
-    space = 2.0 * movers.half_length + ROOM_GAP
-    taken = jnp.where(gaps < to_queue[:, None], space, 0.0).sum(axis=1)
+    to_queue = jnp.where(movers.is_queued[:, None], gaps, FAR).min(axis=0)
+    space = 2.0 * movers.half_length[:, None] + ROOM_GAP
+    taken = jnp.where(gaps < to_queue, space, 0.0).sum(axis=0)
     rests = focus.front + to_queue - taken - ROOM_GAP
     is_free = (to_queue >= FAR) | (rests > focus.length + 2.0 * half_length)
     return ~focus.can_wait | is_free
@@ -278,29 +281,32 @@ def gated(pair: Pairs, may_go: jax.Array) -> jax.Array:
     has_entered = front > ENTERED
     there = (front > theirs.enter) & (others.s - others.half_length < theirs.leave)
     # Two that wait for one another would wait for ever: the one that waited longest goes.
-    order = jnp.arange(others.s.shape[1])
-    first = (pair.wait_s > others.wait_s) | (
-        (pair.wait_s == others.wait_s) & (order[: pair.wait_s.shape[0], None] < order)
-    )
+    mine, other = _order(pair)
+    first = (pair.wait_s > others.wait_s) | ((pair.wait_s == others.wait_s) & (mine < other))
     stands = (pair.wait_s > PATIENCE) & (others.speed < 0.5) & ~others.is_lawless
     inside = has_entered & (others.s - others.half_length < theirs.leave) & ~_joins(pair)
     inside &= (_leaves(pair) + 0.5 * MARGIN > _arrives(pair)) & (there | ~stands)
     margin = jnp.clip(MARGIN * PATIENCE / (PATIENCE + pair.wait_s), LEAST_MARGIN, MARGIN)
     yields = (pair.owes == CONFLICT_YIELD) | others.is_lawless
-    yields |= (pair.owes == CONFLICT) & _is_earlier(pair, order)
-    coming = ~has_entered & may_go[None, :] & yields & _collides(pair, margin)
+    yields |= (pair.owes == CONFLICT) & _is_earlier(pair)
+    coming = ~has_entered & may_go[:, None] & yields & _collides(pair, margin)
     waits = (pair.owes != FREE) & (inside | (coming & ~(stands & first)))
-    return waits.any(axis=1) & (focus.front[:, 0] < ENTERED)
+    return waits.any(axis=0) & (focus.front < ENTERED)
 
 
-def _is_earlier(pair: Pairs, order: jax.Array) -> jax.Array:
+def _order(pair: Pairs) -> tuple[jax.Array, jax.Array]:
+    """(N,) agents and (M, 1) others, numbered: the first goes first if all else is equal."""
+    return jnp.arange(pair.speed.shape[0]), jnp.arange(pair.others.s.shape[0])[:, None]
+
+
+def _is_earlier(pair: Pairs) -> jax.Array:
     """The other car arrives, or has arrived, before the agent."""
     focus, others = pair.focus, pair.others
     mine = jnp.maximum(-focus.front, 0.0) / jnp.maximum(pair.speed, 2.0) - pair.wait_s
     other = jnp.maximum(-others.s - others.half_length, 0.0) / jnp.maximum(others.speed, 2.0)
     other = other - others.wait_s
-    mine_order = order[: mine.shape[0], None]
-    return (other < mine) | ((other == mine) & (order < mine_order))
+    my_order, other_order = _order(pair)
+    return (other < mine) | ((other == mine) & (other_order < my_order))
 
 
 def _collides(pair: Pairs, margin: jax.Array | float) -> jax.Array:
@@ -315,13 +321,13 @@ def _collides(pair: Pairs, margin: jax.Array | float) -> jax.Array:
 
 
 def _arrives(pair: Pairs) -> jax.Array:
-    """(N, M) s until an agent comes to the stretch."""
+    """(M, N) s until an agent comes to the stretch."""
     to_go = pair.mine.enter - pair.focus.front
     return _time(to_go, pair.speed, pair.focus.top_speed)
 
 
 def _leaves(pair: Pairs) -> jax.Array:
-    """(N, M) s until the other car has left the stretch if it goes on as now."""
+    """(M, N) s until the other car has left the stretch if it goes on as now."""
     others = pair.others
     left = pair.theirs.leave - others.s + others.half_length
     return jnp.maximum(left, 0.0) / jnp.maximum(others.speed, SLOWEST)

@@ -76,13 +76,13 @@ def test_what_is_looked_up_is_what_the_host_found(world, pair):
     got = pairs_jit(agents, world.map)
     a, b = (plan[1] - world.first["plain"].lane for plan in plans)
     there, back = (a, found.slot[b]), (b, found.slot[a])
-    assert got.owes[0, 1] == found.conflict[there]
-    assert got.merges[0, 1] == (found.relation[there] & MERGE > 0)
-    assert got.forks[0, 1] == (found.relation[there] & FORK > 0)
+    assert got.owes[1, 0] == found.conflict[there]
+    assert got.merges[1, 0] == (found.relation[there] & MERGE > 0)
+    assert got.forks[1, 0] == (found.relation[there] & FORK > 0)
     # in steps of 1/4 m, outwards
     for stretch, place in ((got.mine, there), (got.theirs, back)):
-        assert 0 <= found.enter[place] - stretch.enter[0, 1] < 0.25
-        assert 0 <= stretch.leave[0, 1] - found.leave[place] < 0.25
+        assert 0 <= found.enter[place] - stretch.enter[1, 0] < 0.25
+        assert 0 <= stretch.leave[1, 0] - found.leave[place] < 0.25
 
 
 def test_follows_on_the_lane_beside_until_they_have_parted(world):
@@ -94,8 +94,8 @@ def test_follows_on_the_lane_beside_until_they_have_parted(world):
             {"lanes": (*left, -1), "lane_s": ahead},
         )
         got = joined_jit(agents, world.map)
-        np.testing.assert_allclose(got[0, 1], gap, atol=1e-4)
-        assert got[1, 0] > 900  # nobody follows who is behind
+        np.testing.assert_allclose(got[1, 0], gap, atol=1e-4)
+        assert got[0, 1] > 900  # nobody follows who is behind
 
 
 def test_follows_whoever_is_nearer_to_where_lanes_join(world):
@@ -109,8 +109,8 @@ def test_follows_whoever_is_nearer_to_where_lanes_join(world):
         {"lanes": (*left, -1), "lane_s": 14.0},
     )
     got = joined_jit(agents, world.map)
-    np.testing.assert_allclose(got[0, 1], 12.0 - 4.457 - 4.0, atol=0.26)
-    assert got[1, 0] > 900
+    np.testing.assert_allclose(got[1, 0], 12.0 - 4.457 - 4.0, atol=0.26)
+    assert got[0, 1] > 900
 
 
 @pytest.mark.parametrize(

@@ -190,7 +190,7 @@ def leaders_jit(agents, stop, ego, place, road_map):
 
 @jax.jit
 def joined_jit(agents, road_map):
-    """(N, N + 1) gaps to cars on lanes that part from or join an agent's own."""
+    """(N + 1, N) gaps to cars on lanes that part from or join an agent's own."""
     clock = lights.clock(f32(0.0), 0)
     stop = right_of_way.stop_ahead(agents, road_map, clock)
     movers = right_of_way.all_movers(
