@@ -23,7 +23,7 @@ from carljax.ppo.networks import ActorCritic
 from carljax.ppo.rollout import rollout
 from carljax.ppo.types import Minibatch, TrainState
 from carljax.ppo.update import update
-from carljax.sim import episodes
+from carljax.sim import autoreset, episodes
 from carljax.sim.env import DrivingEnv, EnvConfig, make_env
 from carljax.sim.town import Town
 from carljax.sim.types import State
@@ -51,14 +51,11 @@ def environment(
 def sim(env: DrivingEnv, num_envs: int, num_steps: int) -> Workload:
     """Steps without observation and network, ended episodes restarted."""
 
-    def one(env: DrivingEnv, state: State, key: jax.Array) -> State:
-        fresh, moved = env.start(key), env.advance(state, jnp.array(ACTION, jnp.float32))
-        return jax.tree.map(lambda a, b: jnp.where(state.done > 0, a, b), fresh, moved)
-
     def steps(env: DrivingEnv, state: State) -> State:
         def step(state: State, t: jax.Array) -> tuple[State, None]:
             keys = jax.random.split(jax.random.fold_in(jax.random.key(1), t), num_envs)
-            return jax.vmap(one, in_axes=(None, 0, 0))(env, state, keys), None
+            action = jnp.tile(jnp.array(ACTION, jnp.float32), (num_envs, 1))
+            return autoreset.advance(env, state, action, keys), None
 
         return jax.lax.scan(step, state, jnp.arange(num_steps))[0]
 

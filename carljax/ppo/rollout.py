@@ -53,8 +53,7 @@ def rollout(
         alpha, beta_, value = forward(network, params, env_state.obs)
         action = jax.vmap(beta.sample)(keys_t[:, 0], alpha, beta_)
         command = beta.to_command(action)
-        autostep = jax.vmap(autoreset.step, in_axes=(None, 0, 0, 0))
-        next_state = autostep(env, env_state, command, keys_t[:, 1])
+        next_state = autoreset.step(env, env_state, command, keys_t[:, 1])
         transition = Transition(
             obs=jax.vmap(storage.keep, in_axes=(None, 0))(env, env_state),
             action=action,

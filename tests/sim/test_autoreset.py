@@ -18,7 +18,7 @@ ENDS, METRICS = carl.REWARD.ends, metric_names(RewardConfig())
 @pytest.fixture(scope="module")
 def step():
     """One batch step with restarts."""
-    return jax.jit(jax.vmap(autoreset.step, in_axes=(None, 0, 0, 0)))
+    return jax.jit(autoreset.step)
 
 
 def keys(seed):
@@ -150,3 +150,17 @@ def test_what_an_episode_adds_up_to_holds_at_its_end(rollout):
             begins[b] = t + 1
             num_ends += 1
     assert num_ends >= NUM_ENVS
+
+
+@pytest.mark.parametrize("ended", [(), (2,), (0, 1, 3, 4, 5), range(NUM_ENVS)])
+def test_few_at_a_time_or_all_masked_is_the_same(small_env, rollout, ended):
+    state = rollout[3].replace(obs=None)
+    is_ended = jnp.zeros(NUM_ENVS, bool).at[jnp.array(ended, int)].set(True)
+    assert autoreset.AT_ONCE < NUM_ENVS  # so that all at once take more than one round
+    few, masked = (
+        strip(jax.jit(restart)(small_env, is_ended, state, keys(7)))
+        for restart in (autoreset._restart_few, autoreset._restart_masked)
+    )
+    chex.assert_trees_all_close(few, masked, rtol=1e-6)
+    fresh = np.asarray(few.pipeline_state.step_count) == 0
+    np.testing.assert_array_equal(fresh, is_ended)
