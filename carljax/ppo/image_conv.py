@@ -99,11 +99,15 @@ def _weight_gradient(x: jax.Array, w: jax.Array, g: jax.Array, stride: int) -> j
     both = jax.lax.optimization_barrier(both.reshape(-1, both.shape[-1]).T)
     blocks = _blocks(x, kernel, stride)
     last = stride * (rows - 1) + 1
-    products = []
-    for i in range(kernel):
-        row = blocks[:, i : i + last : stride].reshape(-1, blocks.shape[-1]).astype(w.dtype)
-        products.append(both @ jax.lax.optimization_barrier(row))
-    banded = jnp.stack(products).reshape(kernel, 2, side * num_out, -1).transpose(0, 1, 3, 2)
+
+    def product(i: jax.Array) -> jax.Array:
+        row = jax.lax.dynamic_slice_in_dim(blocks, i, last, axis=1)[:, ::stride]
+        row = row.reshape(-1, blocks.shape[-1]).astype(w.dtype)
+        return both @ jax.lax.optimization_barrier(row)
+
+    # A loop, so that there is memory for one row of floats at a time.
+    products = jax.lax.map(product, jnp.arange(kernel))
+    banded = products.reshape(kernel, 2, side * num_out, -1).transpose(0, 1, 3, 2)
     return jax.linear_transpose(functools.partial(_banded, stride=stride), w)(banded)[0]
 
 
