@@ -70,6 +70,7 @@ def step(
     seen = corridor.obstacles(others, ego, ego_length)
     free = drivers.free_speed(agents, road_map)
     accel = drivers.accelerations(agents, free, stop, movers, seen, road_map, params)
+    # Else a CPU works them out anew for each field of the agents that follows from them.
     accel, free_speed = once((accel, free.speed))
     key_change, key_plan = jax.random.split(key)
     agents = lane_change.begin(agents, movers, free_speed, road_map, params, key_change)
