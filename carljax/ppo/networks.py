@@ -21,6 +21,7 @@ from flax import linen as nn
 from carljax.ppo.config import NetworkConfig
 from carljax.ppo.conv import conv, matmul, patch_conv
 from carljax.ppo.image_conv import image_conv
+from carljax.ppo.layer_norm import LayerNorm
 from carljax.sim.types import Observation
 
 # Channels, kernel, stride of each convolution. source: CaRL paper, "Architecture" (and Roach's).
@@ -145,9 +146,7 @@ class ConvEncoder(nn.Module):
                 x = conv(x, weight.astype(dtype), stride)
             x += bias.astype(dtype)
             if self.config.layer_norm:
-                axes = (-3, -2, -1)
-                norm = nn.LayerNorm(NORM_EPS, dtype, reduction_axes=axes, feature_axes=axes)
-                x = norm(x)
+                x = LayerNorm(NORM_EPS, dtype)(x)
             x = nn.relu(x)
         return x.reshape(x.shape[0], -1)
 
