@@ -65,7 +65,7 @@ def _layer_norm_bwd(
     del eps
     x, scale, mean, rate = residuals
     normal, inner = (x - mean) * rate, g * scale
-    # Neither the mean nor the size of an image can change: these parts of the gradient are taken out.
+    # Neither mean nor size of an image can change: what would change them is taken out.
     dx = rate * (inner - _mean(inner) - normal * _mean(inner * normal))
     return dx, (g * normal).sum(axis=0), g.sum(axis=0)
 

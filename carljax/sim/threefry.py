@@ -65,8 +65,8 @@ def _split(key: jax.Array, shape: tuple[int, ...]) -> jax.Array:
     return jnp.stack(_numbered(key, shape), axis=-1)
 
 
-def _fold_in(key: jax.Array, data: jax.Array) -> jax.Array:
-    return jnp.stack(_hash(key, jnp.uint32(0), data.astype(np.uint32)))
+def _fold_in(key: jax.Array, data: jax.Array | int) -> jax.Array:
+    return jnp.stack(_hash(key, jnp.uint32(0), jnp.asarray(data, np.uint32)))
 
 
 def _random_bits(key: jax.Array, bit_width: int, shape: tuple[int, ...]) -> jax.Array:
