@@ -32,7 +32,7 @@ class LayerNorm(nn.Module):
         """Maps (N, H, W, C) to as much."""
         scale = self.param("scale", nn.initializers.ones, x.shape[1:])
         bias = self.param("bias", nn.initializers.zeros, x.shape[1:])
-        return layer_norm(x.astype(jnp.float32), scale, bias, self.epsilon).astype(self.dtype)
+        return layer_norm(x, scale, bias, self.epsilon).astype(self.dtype)
 
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(3,))
@@ -40,7 +40,7 @@ def layer_norm(x: jax.Array, scale: jax.Array, bias: jax.Array, eps: float) -> j
     """Normalises each image.
 
     Args:
-      x: (N, H, W, C) float32.
+      x: (N, H, W, C) float32 or bfloat16.
       scale: (H, W, C) float32.
       bias: (H, W, C) float32.
       eps: added to the variance.
@@ -54,9 +54,11 @@ def layer_norm(x: jax.Array, scale: jax.Array, bias: jax.Array, eps: float) -> j
 def _layer_norm_fwd(
     x: jax.Array, scale: jax.Array, bias: jax.Array, eps: float
 ) -> tuple[jax.Array, tuple[jax.Array, ...]]:
-    mean = _mean(x)
-    rate = jax.lax.rsqrt(_mean(jnp.square(x - mean)) + eps)
-    return (x - mean) * rate * scale + bias, (x, scale, mean, rate)
+    centred = x.astype(jnp.float32)
+    mean = _mean(centred)
+    centred -= mean
+    rate = jax.lax.rsqrt(_mean(jnp.square(centred)) + eps)
+    return centred * rate * scale + bias, (x, scale, mean, rate)  # x is kept in its own type
 
 
 def _layer_norm_bwd(
@@ -64,10 +66,10 @@ def _layer_norm_bwd(
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     del eps
     x, scale, mean, rate = residuals
-    normal, inner = (x - mean) * rate, g * scale
+    normal, inner = (x.astype(jnp.float32) - mean) * rate, g * scale
     # Neither mean nor size of an image can change: what would change them is taken out.
     dx = rate * (inner - _mean(inner) - normal * _mean(inner * normal))
-    return dx, (g * normal).sum(axis=0), g.sum(axis=0)
+    return dx.astype(x.dtype), (g * normal).sum(axis=0), g.sum(axis=0)
 
 
 layer_norm.defvjp(_layer_norm_fwd, _layer_norm_bwd)

@@ -68,3 +68,14 @@ def test_the_module_has_flaxs_parameters_and_type(case, dtype):
     assert got.dtype == want.dtype == dtype
     tolerance = {"float32": 1e-5, "bfloat16": 2e-2}[dtype]
     np.testing.assert_allclose(got.astype("float32"), want.astype("float32"), atol=tolerance)
+
+
+def test_bfloat16_is_kept_as_such_for_the_gradient(case):
+    x = case[0].astype("bfloat16")
+    pull_back = jax.vjp(lambda x: layer_norm(x, case[1], case[2], EPS), x)[1]
+    kept = [leaf for leaf in jax.tree.leaves(pull_back) if leaf.shape == x.shape]
+    assert [leaf.dtype for leaf in kept] == ["bfloat16"]
+    dx = pull_back(case[3])[0]
+    assert dx.dtype == "bfloat16"
+    want = jax.vjp(lambda x: layer_norm(x, case[1], case[2], EPS), x.astype("float32"))[1]
+    np.testing.assert_allclose(dx.astype("float32"), want(case[3])[0], atol=2e-2)
