@@ -7,13 +7,15 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from carljax.sim.geometry import to_frame
+from carljax.sim.once import once
+from carljax.sim.raster_marks import spread
 from carljax.sim.types import EgoState
 
 # source: the authors' code, CARLA bird's-eye view
@@ -43,7 +45,7 @@ _SAMPLE_STEP = 0.7  # px
 
 # No index here is negative, and saying so makes the gather over the atlas a fifth faster.
 GATHER: dict[str, Any] = {"mode": "promise_in_bounds", "wrap_negative_indices": False}
-SCATTER: dict[str, Any] = {"mode": "drop", "wrap_negative_indices": False}
+NOWHERE = -1e6  # a row of what is not shown: outside any image, whatever is added
 
 
 @dataclasses.dataclass(frozen=True)
@@ -114,24 +116,52 @@ def pixel(xy: jax.Array, ego: EgoState, config: RasterConfig) -> tuple[jax.Array
     return row, config.width / 2 - ahead_left[..., 1]
 
 
-def flat_index(
-    row: jax.Array, column: jax.Array, shown: jax.Array, config: RasterConfig
-) -> jax.Array:
-    """Flat pixel index, int32; one past the image for what is outside or not shown."""
+def flat_index(row: jax.Array, column: jax.Array, config: RasterConfig) -> jax.Array:
+    """Flat pixel index, int32, of places (...) px; one past the image for what is outside."""
     row, column = jnp.floor(row).astype(jnp.int32), jnp.floor(column).astype(jnp.int32)
-    shown = shown & (row.astype(jnp.uint32) < config.height)
-    shown &= column.astype(jnp.uint32) < config.width
-    return jnp.where(shown, row * config.width + column, config.height * config.width)
+    # Unsigned, a negative number is larger than any size.
+    inside = (row.astype(jnp.uint32) < config.height) & (column.astype(jnp.uint32) < config.width)
+    return jnp.where(inside, row * config.width + column, config.height * config.width)
+
+
+class Poses(NamedTuple):
+    """Where things are on the image, (K,) each.
+
+    Attributes:
+      row, column: px, as from `pixel`.
+      cos, sin: of their direction relative to the ego's.
+    """
+
+    row: jax.Array
+    column: jax.Array
+    cos: jax.Array
+    sin: jax.Array
+
+    def moved(self, ahead: jax.Array | float, left: jax.Array | float) -> Poses:
+        """Poses so many px ahead of and to the left of these, in the same direction."""
+        row = self.row - self.cos * ahead + self.sin * left
+        return self._replace(row=row, column=self.column - self.sin * ahead - self.cos * left)
+
+
+def poses(xy: jax.Array, yaw: jax.Array, ego: EgoState, config: RasterConfig) -> Poses:
+    """Poses on the image.
+
+    Args:
+      xy: (K, 2) m.
+      yaw: (K,) rad.
+      ego: pose of the image.
+      config: size and content.
+    """
+    turn = yaw - ego.yaw
+    return once(Poses(*pixel(xy, ego, config), jnp.cos(turn), jnp.sin(turn)))
 
 
 def box_pixels(
-    xy: jax.Array,
-    turn: jax.Array,
+    middle: Poses,
     length: jax.Array,
     width: jax.Array,
     shown: jax.Array,
     limits: tuple[float, float],
-    ego: EgoState,
     config: RasterConfig,
 ) -> jax.Array:
     """Pixels of boxes, by a grid of sample points in each.
@@ -140,13 +170,11 @@ def box_pixels(
     just the pixels whose centres it holds.
 
     Args:
-      xy: (K, 2) m, centres.
-      turn: (K,) rad, direction of their length relative to the ego's.
+      middle: (K,).
       length: (K,) m.
       width: (K,) m.
       shown: (K,) bool.
       limits: m, length and width up to which no gap shows; they fix the number of samples.
-      ego: pose of the image.
       config: size and content.
 
     Returns:
@@ -155,22 +183,33 @@ def box_pixels(
     px = config.pixels_per_metre
     steps = [math.ceil(max(limit * px - 1.0, 0.0) / _SAMPLE_STEP) for limit in limits]
     lines = [np.linspace(-1.0, 1.0, n + 1) if n else np.zeros(1) for n in steps]
-    along, across = np.stack(np.meshgrid(*lines), axis=0).reshape(2, -1).astype(np.float32)
+    along, across = np.stack(np.meshgrid(*lines), axis=0).reshape(2, -1)
     half_length = jnp.maximum(0.5 * length * px - 0.5, 0.0)
     half_width = jnp.maximum(0.5 * width * px - 0.5, 0.0)
-    cos, sin = jnp.cos(turn), jnp.sin(turn)
-    row, column = pixel(xy, ego, config)
-    row = row[:, None] - (cos * half_length)[:, None] * along
-    column = column[:, None] - (sin * half_length)[:, None] * along
+    row, column, cos, sin = middle
+    row = jnp.where(shown, row, NOWHERE)
+    grid = (1.0, along, across)
     return flat_index(
-        row + (sin * half_width)[:, None] * across,
-        column - (cos * half_width)[:, None] * across,
-        shown[:, None],
+        spread((row, -cos * half_length, sin * half_width), grid),
+        spread((column, -sin * half_length, -cos * half_width), grid),
         config,
     )
 
 
-def draw(image: jax.Array, index: jax.Array, channel: int, value: jax.Array) -> jax.Array:
-    """Scatters values (K,) to pixels (K, S) of one channel of the (H * W, 10) image."""
-    value = value.astype(jnp.uint8)[:, None]
-    return image.at[index, channel].max(value, **SCATTER)
+def ray_pixels(begin: Poses, length: jax.Array, longest: float, config: RasterConfig) -> jax.Array:
+    """Pixels of rays, a sample point each pixel of their length.
+
+    Args:
+      begin: (K,), where they come from and their direction.
+      length: (K,) m; below 0 for none.
+      longest: m; longer rays end there.
+      config: size and content.
+
+    Returns:
+      (K, S) int32 flat pixel indices.
+    """
+    px = config.pixels_per_metre
+    grid = (1.0, np.arange(math.ceil(longest * px) + 1))
+    left = spread((length * px, jnp.full_like(length, -1.0)), grid)
+    row = jnp.where(left >= 0.0, spread((begin.row, -begin.cos), grid), NOWHERE)
+    return flat_index(row, spread((begin.column, -begin.sin), grid), config)

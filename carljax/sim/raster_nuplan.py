@@ -22,7 +22,8 @@ import numpy as np
 
 from carljax.sim import lights, raster_road
 from carljax.sim.nuplan_atlas import BORDER, DRIVABLE, STOP_LINE, NuplanAtlas
-from carljax.sim.raster_canvas import GATHER, SCATTER, RasterConfig, box_pixels, flat_index, pixel
+from carljax.sim.raster_canvas import GATHER, RasterConfig, box_pixels, pixel, poses, ray_pixels
+from carljax.sim.raster_marks import draw_channel
 from carljax.sim.raster_users import BUS_SIZE, CAR_SIZE, HEIGHT_REACH, NUM_LARGE
 from carljax.sim.road_map import RoadMap
 from carljax.sim.route import Route
@@ -186,18 +187,9 @@ def _static(
 
 def _ego_box(image: jax.Array, ego: EgoState, size: jax.Array, config: RasterConfig) -> jax.Array:
     """Draws the ego's own box."""
-    at = box_pixels(
-        ego.xy[None],
-        jnp.zeros(1, jnp.float32),
-        size[:1],
-        size[1:],
-        jnp.ones(1, bool),
-        CAR_SIZE,
-        ego,
-        config,
-    )
-    value = speed_value(ego.speed, SPEED_MAX).astype(jnp.uint8)
-    return image.at[at, _EGO].max(value, **SCATTER)
+    middle = poses(ego.xy[None], ego.yaw[None], ego, config)
+    at = box_pixels(middle, size[:1], size[1:], jnp.ones(1, bool), CAR_SIZE, config)
+    return draw_channel(image, at, _EGO, speed_value(ego.speed, SPEED_MAX)[None])
 
 
 def _shown(ego: EgoState, agents: Agents, config: RasterConfig) -> jax.Array:
@@ -220,41 +212,32 @@ def _road_users(image: jax.Array, ego: EgoState, agents: Agents, config: RasterC
     """Draws boxes: all as if they were no larger than cars, then the few large ones again."""
     shown = _shown(ego, agents, config)
     channel, value = _values(agents)
-    turn = agents.yaw - ego.yaw
-    length, width = jnp.minimum(agents.length, CAR_SIZE[0]), jnp.minimum(agents.width, CAR_SIZE[1])
-    at = box_pixels(agents.xy, turn, length, width, shown, CAR_SIZE, ego, config)
-    image = image.at[at, channel[:, None]].max(value[:, None], **SCATTER)
+    at = poses(agents.xy, agents.yaw, ego, config)
+    size = jnp.minimum(agents.length, CAR_SIZE[0]), jnp.minimum(agents.width, CAR_SIZE[1])
+    image = draw_channel(image, box_pixels(at, *size, shown, CAR_SIZE, config), channel, value)
     excess = jnp.maximum(agents.length - CAR_SIZE[0], agents.width - CAR_SIZE[1])
     excess, large = jax.lax.top_k(jnp.where(shown, excess, -1.0), min(NUM_LARGE, len(shown)))
+    at, channel, value = jax.tree.map(lambda x: x[large], (at, channel, value))
     size = agents.length[large], agents.width[large]
-    at = box_pixels(agents.xy[large], turn[large], *size, excess > 0.0, BUS_SIZE, ego, config)
-    return image.at[at, channel[large, None]].max(value[large, None], **SCATTER)
+    pixels = box_pixels(at, *size, excess > 0.0, BUS_SIZE, config)
+    return draw_channel(image, pixels, channel, value)
 
 
 def _speed_lines(
     image: jax.Array, ego: EgoState, ego_size: jax.Array, agents: Agents, config: RasterConfig
 ) -> jax.Array:
     """Draws lines from the middle of everybody who moves, the ego included."""
-    px = config.pixels_per_metre
     channel, value = _values(agents)
     shown = _shown(ego, agents, config) & (agents.kind != KIND_STATIC)
 
     def with_ego(others: jax.Array, own: jax.Array | int) -> jax.Array:
         return jnp.append(others, jnp.asarray(own, others.dtype)[None], axis=0)
 
-    row, column = pixel(with_ego(agents.xy, ego.xy), ego, config)
-    turn = with_ego(agents.yaw, ego.yaw)[:, None] - ego.yaw
     speed, length = with_ego(agents.speed, ego.speed), with_ego(agents.length, ego_size[0])
-    farthest = math.hypot(config.height, config.width)
-    out = np.arange(math.ceil(min(farthest, (SPEED_MAX * SPEED_LINE_S + BUS_SIZE[0]) * px)) + 1)
-    out = out.astype(np.float32)
-    reach = (0.5 * length + SPEED_LINE_S * speed) * px
-    at = flat_index(
-        row[:, None] - jnp.cos(turn) * out,
-        column[:, None] - jnp.sin(turn) * out,
-        with_ego(shown, True)[:, None] & (out <= reach[:, None]),
-        config,
-    )
-    channel = with_ego(channel, _EGO)
+    reach = jnp.where(with_ego(shown, True), 0.5 * length + SPEED_LINE_S * speed, -1.0)
+    begin = poses(with_ego(agents.xy, ego.xy), with_ego(agents.yaw, ego.yaw), ego, config)
+    diagonal = math.hypot(config.height, config.width) / config.pixels_per_metre
+    longest = min(diagonal, SPEED_MAX * SPEED_LINE_S + BUS_SIZE[0])
+    at = ray_pixels(begin, reach, longest, config)
     value = with_ego(value, speed_value(ego.speed, SPEED_MAX))
-    return image.at[at, channel[:, None]].max(value[:, None], **SCATTER)
+    return draw_channel(image, at, with_ego(channel, _EGO), value)

@@ -20,7 +20,8 @@ import numpy as np
 
 from carljax.sim import raster_road, raster_spans
 from carljax.sim.geometry import from_frame
-from carljax.sim.raster_canvas import GATHER, SCATTER, RasterConfig, box_pixels
+from carljax.sim.raster_canvas import GATHER, RasterConfig, box_pixels, poses
+from carljax.sim.raster_marks import SCATTER
 from carljax.sim.raster_road import LANE_WIDTH_MAX, LIGHTS_BEHIND, STOP_LINE_FRAC
 from carljax.sim.road_map import LAYER_MARK_BROKEN, LAYER_MARK_SOLID, LAYER_ROAD, RoadMap
 from carljax.sim.route import Route
@@ -202,16 +203,13 @@ def _signals(
     colour = light[:, line].T
     value = jnp.where(colour == LIGHT_YELLOW, YELLOW_VALUE, GREEN_VALUE)
     value = jnp.where(colour == LIGHT_RED, RED_VALUE, value)  # (most, 4)
-    turn = route.stop_yaw - ego.yaw
     width = route.stop_width
     at = box_pixels(
-        route.stop_xy[line],
-        turn[line],
+        poses(route.stop_xy[line], route.stop_yaw[line], ego, config),
         jnp.full(most, STOP_LINE_THICKNESS, jnp.float32),
         width[line] * STOP_LINE_FRAC,
         near[line],
         (STOP_LINE_THICKNESS, LANE_WIDTH_MAX * STOP_LINE_FRAC),
-        ego,
         config,
     )
     image = _scatter(image, at, value)
@@ -220,13 +218,11 @@ def _signals(
         # The same sign at a later moment has been drawn with it.
         seen = (stop[moment] >= 0) & jnp.all(stop[:moment] != stop[moment])
         at = box_pixels(
-            route.stop_xy[sign],
-            turn[sign],
+            poses(route.stop_xy[sign], route.stop_yaw[sign], ego, config),
             width[sign],
             width[sign],
             seen[None],
             (LANE_WIDTH_MAX, LANE_WIDTH_MAX),
-            ego,
             config,
         )
         image = _scatter(image, at, jnp.where(stop == stop[moment], STOP_VALUE, 0)[None])

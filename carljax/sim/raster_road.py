@@ -11,13 +11,14 @@ import numpy as np
 from carljax.sim.raster_canvas import (
     CHANNELS,
     GATHER,
-    SCATTER,
+    NOWHERE,
     RasterConfig,
     box_pixels,
-    draw,
     flat_index,
     pixel,
+    poses,
 )
+from carljax.sim.raster_marks import SCATTER, draw_channel, spread
 from carljax.sim.raster_users import speed_value
 from carljax.sim.road_map import (
     LAYER_MARK_BROKEN,
@@ -141,10 +142,10 @@ def route(
     radius = ROUTE_RADIUS * config.pixels_per_metre
     down, right = np.mgrid[-int(radius) : int(radius) + 1, -int(radius) : int(radius) + 1]
     disc = down**2 + right**2 <= radius**2
+    one = jnp.ones(num)
     index = flat_index(
-        jnp.floor(row)[:, None] + down[disc].astype(np.float32),
-        jnp.floor(column)[:, None] + right[disc].astype(np.float32),
-        shown[:, None],
+        spread((jnp.where(shown, jnp.floor(row), NOWHERE), one), (1.0, down[disc])),
+        spread((jnp.floor(column), one), (1.0, right[disc])),
         config,
     )
     return ground.at[index].apply(lambda bits: bits | jnp.uint8(ROUTE_BIT), **SCATTER)
@@ -165,16 +166,14 @@ def lights(
     value = jnp.where(light_state == LIGHT_RED, 255, GREEN_VALUE)
     value = jnp.where(light_state == LIGHT_YELLOW, yellow_value(light_time_left), value)
     index = box_pixels(
-        route.stop_xy,
-        route.stop_yaw - ego.yaw,
+        poses(route.stop_xy, route.stop_yaw, ego, config),
         jnp.full_like(route.stop_width, STOP_LINE_THICKNESS),
         route.stop_width * STOP_LINE_FRAC,
         near,
         (STOP_LINE_THICKNESS, LANE_WIDTH_MAX * STOP_LINE_FRAC),
-        ego,
         config,
     )
-    return draw(image, index, LIGHTS, value)
+    return draw_channel(image, index, LIGHTS, value)
 
 
 def stop_sign(
@@ -189,16 +188,14 @@ def stop_sign(
     asks, first = asking_stop_sign(route, route_idx, stop_satisfied)
     first = first[None]
     index = box_pixels(
-        route.stop_xy[first],
-        route.stop_yaw[first] - ego.yaw,
+        poses(route.stop_xy[first], route.stop_yaw[first], ego, config),
         route.stop_width[first],
         route.stop_width[first],
         asks[first],
         (LANE_WIDTH_MAX, LANE_WIDTH_MAX),
-        ego,
         config,
     )
-    return draw(image, index, STOP, jnp.full((1,), 255))
+    return draw_channel(image, index, STOP, jnp.full((1,), 255))
 
 
 def asking_stop_sign(
@@ -220,16 +217,14 @@ def speed_signs(
     yaw = route.yaw[jnp.clip(route.sign_idx, 0, route.yaw.shape[0] - 1)]
     side = jnp.full_like(route.sign_limit, SPEED_SIGN_SIDE)
     index = box_pixels(
-        route.sign_xy,
-        yaw - ego.yaw,
+        poses(route.sign_xy, yaw, ego, config),
         side,
         side,
         near,
         (SPEED_SIGN_SIDE, SPEED_SIGN_SIDE),
-        ego,
         config,
     )
-    return draw(image, index, SPEED_SIGNS, speed_value(route.sign_limit))
+    return draw_channel(image, index, SPEED_SIGNS, speed_value(route.sign_limit))
 
 
 def yellow_value(time_left: jax.Array) -> jax.Array:

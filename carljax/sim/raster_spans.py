@@ -12,7 +12,8 @@ import math
 import jax
 import jax.numpy as jnp
 
-from carljax.sim.raster_canvas import SCATTER, RasterConfig, pixel
+from carljax.sim.raster_canvas import RasterConfig, pixel
+from carljax.sim.raster_marks import SCATTER
 from carljax.sim.types import EgoState
 
 PLANES_PER_WORD = 4

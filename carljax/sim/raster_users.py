@@ -6,14 +6,12 @@ onto a canvas, and of two road users the larger code stays.
 
 from __future__ import annotations
 
-import math
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from carljax.sim import geometry
-from carljax.sim.raster_canvas import SCATTER, RasterConfig, box_pixels, flat_index, pixel
+from carljax.sim.raster_canvas import Poses, RasterConfig, box_pixels, poses, ray_pixels
+from carljax.sim.raster_marks import draw
 from carljax.sim.types import (
     DOOR_FRONT_LEFT,
     DOOR_FRONT_RIGHT,
@@ -106,13 +104,14 @@ def road_users(ego: EgoState, agents: Agents, config: RasterConfig) -> jax.Array
       (H * W,) uint8 codes, see `channels`; 0 where nobody is.
     """
     shown = agents.valid & (jnp.abs(agents.z - ego.z) < HEIGHT_REACH)
+    at = poses(agents.xy, agents.yaw, ego, config)
     code = _codes(agents)
     canvas = jnp.zeros(config.height * config.width, jnp.uint8)
-    canvas = _boxes(canvas, ego, agents, shown, code, config)
-    canvas = _forecast_lines(canvas, ego, agents, shown, code, config)
+    canvas = _boxes(canvas, at, agents, shown, code, config)
+    canvas = _forecast_lines(canvas, at, agents, shown, code, config)
     is_vehicle = shown & (agents.kind == KIND_VEHICLE)
-    canvas = _doors(canvas, ego, agents, is_vehicle, code, config)
-    return _lights(canvas, ego, agents, is_vehicle, config)
+    canvas = _doors(canvas, at, agents, is_vehicle, code, config)
+    return _lights(canvas, at, agents, is_vehicle, config)
 
 
 def _codes(agents: Agents) -> jax.Array:
@@ -125,7 +124,7 @@ def _codes(agents: Agents) -> jax.Array:
 
 def _boxes(
     canvas: jax.Array,
-    ego: EgoState,
+    at: Poses,
     agents: Agents,
     shown: jax.Array,
     code: jax.Array,
@@ -134,47 +133,33 @@ def _boxes(
     """Bodies: all as if they were no larger than cars, then the few large ones again."""
     least = jnp.where(agents.kind == KIND_STATIC, 0.0, 2 * HALF_EXTENT_MIN)
     length, width = jnp.maximum(agents.length, least), jnp.maximum(agents.width, least)
-    turn = agents.yaw - ego.yaw
-    car_length, car_width = jnp.minimum(length, CAR_SIZE[0]), jnp.minimum(width, CAR_SIZE[1])
-    at = box_pixels(agents.xy, turn, car_length, car_width, shown, CAR_SIZE, ego, config)
-    canvas = canvas.at[at].max(code[:, None], **SCATTER)
+    size = jnp.minimum(length, CAR_SIZE[0]), jnp.minimum(width, CAR_SIZE[1])
+    canvas = draw(canvas, box_pixels(at, *size, shown, CAR_SIZE, config), code)
     excess = jnp.maximum(length - CAR_SIZE[0], width - CAR_SIZE[1])
     excess, large = jax.lax.top_k(jnp.where(shown, excess, -1.0), min(NUM_LARGE, len(shown)))
-    size = (length[large], width[large])
-    at = box_pixels(agents.xy[large], turn[large], *size, excess > 0.0, BUS_SIZE, ego, config)
-    return canvas.at[at].max(code[large, None], **SCATTER)
+    at, length, width, code = jax.tree.map(lambda x: x[large], (at, length, width, code))
+    return draw(canvas, box_pixels(at, length, width, excess > 0.0, BUS_SIZE, config), code)
 
 
 def _forecast_lines(
     canvas: jax.Array,
-    ego: EgoState,
+    at: Poses,
     agents: Agents,
     shown: jax.Array,
     code: jax.Array,
     config: RasterConfig,
 ) -> jax.Array:
     """Lines of a second's way ahead of whoever can move."""
-    px = config.pixels_per_metre
     moves = shown & (agents.kind != KIND_STATIC)
-    length = jnp.maximum(agents.length, 2 * HALF_EXTENT_MIN)
-    row, column = pixel(agents.xy, ego, config)
-    farthest = (SPEED_RANGE - SPEED_OFFSET) * FORECAST_S * px
-    step = np.arange(math.ceil(farthest) + 1, dtype=np.float32)
-    reach = jnp.clip(agents.speed * FORECAST_S, FORECAST_MIN) * px
-    out = 0.5 * length[:, None] * px + step
-    turn = (agents.yaw - ego.yaw)[:, None]
-    at = flat_index(
-        row[:, None] - jnp.cos(turn) * out,
-        column[:, None] - jnp.sin(turn) * out,
-        moves[:, None] & (step <= reach[:, None]),
-        config,
-    )
-    return canvas.at[at].max(code[:, None], **SCATTER)
+    front = 0.5 * jnp.maximum(agents.length, 2 * HALF_EXTENT_MIN) * config.pixels_per_metre
+    reach = jnp.where(moves, jnp.maximum(agents.speed * FORECAST_S, FORECAST_MIN), -1.0)
+    longest = (SPEED_RANGE - SPEED_OFFSET) * FORECAST_S
+    return draw(canvas, ray_pixels(at.moved(front, 0.0), reach, longest, config), code)
 
 
 def _doors(
     canvas: jax.Array,
-    ego: EgoState,
+    at: Poses,
     agents: Agents,
     shown: jax.Array,
     code: jax.Array,
@@ -183,24 +168,24 @@ def _doors(
     """Open doors, coded as the vehicle is."""
     is_open = shown & (agents.signals >= min(DOORS))
     is_open, row = jax.lax.top_k(is_open.astype(jnp.int32), min(NUM_OPEN, len(shown)))
-    some = jax.tree.map(lambda x: x[row], agents)
-    at = _parts(ego, some, is_open > 0, DOORS, (DOOR_LENGTH, DOOR_WIDTH), config)
-    return canvas.at[at].max(jnp.tile(code[row], len(DOORS))[:, None], **SCATTER)
+    at, signals, code = jax.tree.map(lambda x: x[row], (at, agents.signals, code))
+    pixels = _parts(at, signals, is_open > 0, DOORS, (DOOR_LENGTH, DOOR_WIDTH), config)
+    return draw(canvas, pixels, jnp.tile(code, len(DOORS)))
 
 
 def _lights(
-    canvas: jax.Array, ego: EgoState, agents: Agents, shown: jax.Array, config: RasterConfig
+    canvas: jax.Array, at: Poses, agents: Agents, shown: jax.Array, config: RasterConfig
 ) -> jax.Array:
     """Brake, emergency and indicator lights, each with a byte of its own."""
     places = {bit: (ahead, left) for bit, (_, ahead, left) in LIGHTS.items()}
-    at = _parts(ego, agents, shown, places, (LIGHT_SIDE, LIGHT_SIDE), config)
-    code = _LIGHT + np.repeat(np.arange(len(LIGHTS), dtype=np.uint8), shown.shape[0])
-    return canvas.at[at].max(jnp.asarray(code.astype(np.uint8))[:, None], **SCATTER)
+    pixels = _parts(at, agents.signals, shown, places, (LIGHT_SIDE, LIGHT_SIDE), config)
+    code = _LIGHT + np.repeat(np.arange(len(LIGHTS)), shown.shape[0])
+    return draw(canvas, pixels, jnp.asarray(code, jnp.uint8))
 
 
 def _parts(
-    ego: EgoState,
-    agents: Agents,
+    at: Poses,
+    signals: jax.Array,
     shown: jax.Array,
     places: dict[int, tuple[float, float]],
     size: tuple[float, float],
@@ -209,8 +194,8 @@ def _parts(
     """Pixels of boxes of one size fixed to vehicles that show some bits of `Agents.signals`.
 
     Args:
-      ego: pose of the image.
-      agents: (N,) road users.
+      at: (N,) middles of the vehicles.
+      signals: (N,) int32.
       shown: (N,) bool.
       places: {bit: m ahead of and to the left of the vehicle's middle}.
       size: m, along and across the vehicle.
@@ -219,13 +204,9 @@ def _parts(
     Returns:
       (len(places) * N, S) int32 flat pixel indices, bit by bit.
     """
-    middles = [
-        geometry.from_frame(jnp.asarray(place, jnp.float32), agents.xy, agents.yaw)
-        for place in places.values()
-    ]
-    lit = [shown & ((agents.signals & bit) > 0) for bit in places]
-    turn = jnp.tile(agents.yaw - ego.yaw, len(places))
-    along, across = (jnp.full_like(turn, extent) for extent in size)
-    return box_pixels(
-        jnp.concatenate(middles), turn, along, across, jnp.concatenate(lit), size, ego, config
-    )
+    px = config.pixels_per_metre
+    middles = [at.moved(ahead * px, left * px) for ahead, left in places.values()]
+    lit = jnp.concatenate([shown & ((signals & bit) > 0) for bit in places])
+    middle = jax.tree.map(lambda *x: jnp.concatenate(x), *middles)
+    along, across = (jnp.full(lit.shape, extent) for extent in size)
+    return box_pixels(middle, along, across, lit, size, config)
