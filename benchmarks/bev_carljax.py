@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
-from typing import NamedTuple
+import functools
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
 import bev_scene
 import jax
 import jax.numpy as jnp
 import numpy as np
 from bev_scene import LANE_WIDTH, REACH, SHOULDER_WIDTH, Road, Scene, Users
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from carljax.sim import atlas, rasterizer
 from carljax.sim.population import nobody
@@ -93,6 +95,31 @@ def frames(road_map: RoadMap, seen: Seen, turn: jax.Array, num_steps: int) -> ja
     num = seen.ego.yaw.shape[0]
     begin = jnp.zeros((num, *CONFIG.shape), jnp.uint8)
     return jax.lax.scan(frame, begin, jnp.arange(num_steps))[0]
+
+
+def shared(
+    num_steps: int, devices: Sequence[jax.Device], *given: Any
+) -> tuple[Callable[..., jax.Array], tuple[Any, ...]]:
+    """`frames` on several devices, each with its share of the scenes.
+
+    Args:
+      num_steps: frames of each scene.
+      devices: as many as divide the scenes.
+      *given: the other arguments of `frames`.
+
+    Returns:
+      The function, to be compiled, and its arguments, where they belong.
+    """
+    mesh = Mesh(np.array(devices), ("scenes",))
+    specs = (PartitionSpec(), PartitionSpec("scenes"), PartitionSpec())
+    function = jax.shard_map(
+        functools.partial(frames, num_steps=num_steps),
+        mesh=mesh,
+        in_specs=specs,
+        out_specs=PartitionSpec("scenes"),
+        check_vma=False,
+    )
+    return function, jax.device_put(given, tuple(NamedSharding(mesh, spec) for spec in specs))
 
 
 def road_map(roads: Sequence[Road]) -> RoadMap:

@@ -1,17 +1,17 @@
 """Our image against OpenCV's: `python benchmarks/bev_opencv.py` (extra `bench`).
 
-The same scenes (see `bev_scene`) at 256 x 256 x 10 px and 2 px/m, once as a compiled batch on all
-cores and once by one OpenCV process a core (see `bev_cv2`), in turn. Prints frames/s of both, their
-ratio round by round, and the share of pixels that are equal in all ten channels. The status is 1
-where that is less than 99 %.
+The same scenes (see `bev_scene`) at 256 x 256 x 10 px and 2 px/m, once as a compiled batch on one
+device a core and once by one OpenCV process a core (see `bev_cv2`), in turn. Prints frames/s of
+both, their ratio round by round, and the share of pixels that are equal in all ten channels. The
+status is 1 where that is less than 99 %.
 """
 
 from __future__ import annotations
 
 import contextlib
 import dataclasses
-import functools
 import importlib.util
+import math
 import multiprocessing
 import os
 import queue
@@ -39,14 +39,18 @@ TURN = 0.01  # rad that the ego turns from frame to frame, on either side
 class Command:
     """What to measure."""
 
-    scenes: int = 32
+    scenes: int = 8
     """Different scenes; ours draws so many at once, as many environments would."""
-    steps: int = 20
+    steps: int = 80
     """Frames of each scene in a timed call, on either side."""
     repeats: int = 7
     """Timed calls of each side, at least 5, in turn."""
     processes: int | None = None
     """OpenCV processes; one for each core that this process may use by default."""
+    devices: int | None = None
+    """Devices that the CPU is made to look like for ours, which share the scenes; one for each core
+    by default, or as many as divide the scenes. One alone uses all cores, too, but now and then it
+    has work for only one."""
 
 
 def main() -> int:
@@ -54,6 +58,7 @@ def main() -> int:
     command = tyro.cli(Command, description=__doc__)
     try:
         check(command)
+        jax.config.update("jax_num_cpu_devices", num_devices(command))
         line = compare(command)
     except UsageError as error:
         print(f"error: {error}", file=sys.stderr)
@@ -69,12 +74,24 @@ def check(command: Command) -> None:
       UsageError: something is too small or missing.
     """
     measure.check_repeats(command.repeats)
-    for name in ("scenes", "steps", "processes"):
+    for name in ("scenes", "steps", "processes", "devices"):
         value = getattr(command, name)
         if value is not None and value < 1:
             raise UsageError(f"--{name} {value}: is below the least, 1")
+    if command.scenes % num_devices(command):
+        raise UsageError(f"--devices {command.devices}: {command.scenes} scenes don't divide so")
     if importlib.util.find_spec("cv2") is None:
         raise UsageError("OpenCV is not installed: pip install -e '.[bench]'")
+
+
+def num_devices(command: Command) -> int:
+    """Devices that share the scenes."""
+    return command.devices or math.gcd(command.scenes, num_cores())
+
+
+def num_cores() -> int:
+    """Cores that this process may use."""
+    return len(os.sched_getaffinity(0))
 
 
 def compare(command: Command) -> dict[str, Any]:
@@ -84,9 +101,10 @@ def compare(command: Command) -> dict[str, Any]:
     scenes = [bev_scene.make(seed) for seed in range(command.scenes)]
     roads = bev_scene.roads()
     given = bev_carljax.road_map(roads), bev_carljax.stack(scenes), jnp.float32(TURN)
-    program = measure.jit(functools.partial(bev_carljax.frames, num_steps=command.steps))
+    frames, given = bev_carljax.shared(command.steps, jax.devices()[: num_devices(command)], *given)
+    program = measure.jit(frames)
     images = np.asarray(jax.block_until_ready(program(*given)))
-    processes = command.processes or len(os.sched_getaffinity(0))
+    processes = command.processes or num_cores()
     each = -(-command.scenes * command.steps // processes)
     ours, theirs = [], []
     with opencv(bev_cv2.work, processes, command.scenes) as draw:
@@ -108,6 +126,7 @@ def compare(command: Command) -> dict[str, Any]:
         "opencv_seconds": measure.spread(theirs),
         "scenes": command.scenes,
         "steps": command.steps,
+        "shared_by_devices": num_devices(command),
         "opencv_processes": processes,
         "opencv": bev_cv2.cv2.__version__,
         "shape": list(bev_carljax.CONFIG.shape),

@@ -37,6 +37,23 @@ def test_at_least_one_scene_is_asked_for(monkeypatch, capsys):
     assert capsys.readouterr().err == "error: --scenes 0: is below the least, 1\n"
 
 
+def test_devices_have_to_divide_the_scenes(monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["bev_opencv", "--devices", "3"])
+    assert bev_opencv.main() == 2
+    assert capsys.readouterr().err == "error: --devices 3: 8 scenes don't divide so\n"
+
+
+def test_devices_share_the_scenes():
+    scenes = bev_carljax.stack([bev_scene.make(seed) for seed in range(2)])
+    given = bev_carljax.road_map(bev_scene.roads()), scenes, jnp.float32(0.01)
+    images = [
+        np.asarray(jax.jit(frames)(*placed))
+        for frames, placed in (bev_carljax.shared(1, jax.devices()[:num], *given) for num in (1, 2))
+    ]
+    np.testing.assert_array_equal(*images)
+    assert images[0].any()
+
+
 def test_the_sizes_of_a_learner_have_to_divide(monkeypatch, capsys):
     monkeypatch.setattr(learner_torch.importlib.util, "find_spec", lambda name: name)
     monkeypatch.setattr(sys, "argv", ["learner_torch", "--samples", "1000"])
