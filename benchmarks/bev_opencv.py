@@ -13,7 +13,6 @@ import dataclasses
 import importlib.util
 import math
 import multiprocessing
-import os
 import queue
 import sys
 from collections.abc import Callable, Iterator, Sequence
@@ -28,7 +27,7 @@ import numpy as np
 import tyro
 from measure import UsageError
 
-from carljax import timing
+from carljax import machine, timing
 from carljax.sim.raster_canvas import CHANNELS
 
 LEAST_EQUAL = 0.99
@@ -58,7 +57,7 @@ def main() -> int:
     command = tyro.cli(Command, description=__doc__)
     try:
         check(command)
-        jax.config.update("jax_num_cpu_devices", num_devices(command))
+        machine.offer_devices(num_devices(command))
         line = compare(command)
     except UsageError as error:
         print(f"error: {error}", file=sys.stderr)
@@ -86,12 +85,7 @@ def check(command: Command) -> None:
 
 def num_devices(command: Command) -> int:
     """Devices that share the scenes."""
-    return command.devices or math.gcd(command.scenes, num_cores())
-
-
-def num_cores() -> int:
-    """Cores that this process may use."""
-    return len(os.sched_getaffinity(0))
+    return command.devices or math.gcd(command.scenes, machine.num_cores())
 
 
 def compare(command: Command) -> dict[str, Any]:
@@ -104,7 +98,7 @@ def compare(command: Command) -> dict[str, Any]:
     frames, given = bev_carljax.shared(command.steps, jax.devices()[: num_devices(command)], *given)
     program = measure.jit(frames)
     images = np.asarray(jax.block_until_ready(program(*given)))
-    processes = command.processes or num_cores()
+    processes = command.processes or machine.num_cores()
     each = -(-command.scenes * command.steps // processes)
     ours, theirs = [], []
     with opencv(bev_cv2.work, processes, command.scenes) as draw:

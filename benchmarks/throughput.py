@@ -15,7 +15,7 @@ import tyro
 import workloads
 from measure import UsageError
 
-from carljax import build, presets
+from carljax import build, machine, presets
 from carljax.config import TrainConfig
 from carljax.ppo import trainer
 from carljax.sim.env import ObservationKind
@@ -49,7 +49,7 @@ class Command:
     num_steps: int | None = None
     """Steps of each in a rollout; the preset's by default."""
     num_devices: int = 1
-    """Devices of end_to_end."""
+    """Devices of end_to_end; a CPU is made to look like so many, one a core at most."""
 
 
 def main() -> int:
@@ -82,6 +82,7 @@ def configure(command: Command) -> TrainConfig:
         if ppo.micro_batch_size is not None:
             share = max(ppo.minibatch_size // max(command.num_devices, 1), 1)
             ppo = dataclasses.replace(ppo, micro_batch_size=min(ppo.micro_batch_size, share))
+        machine.offer_devices(command.num_devices)
         trainer.make_mesh(command.num_devices)
         ppo.validate(command.num_devices)
     except ValueError as error:

@@ -62,7 +62,7 @@ class RunConfig:
     for each town. None: routes are drawn."""
     num_devices: int | None = None
     """Accelerators or CPU devices to share the environments among, of all processes together and
-    equally many of each; all by default."""
+    equally many of each; all by default. A CPU is made to look like so many, one a core at most."""
     obs_storage: Literal["auto", "store", "pack", "rerender"] = "auto"
     """How a batch's images are kept until the update has used them: as they are, in few bits, or
     drawn again from the simulator's states. The result is the same. auto: the first of these

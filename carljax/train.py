@@ -22,6 +22,7 @@ from carljax import (
     distributed,
     evaluate,
     learn,
+    machine,
     memory,
     presets,
     run_dir,
@@ -132,6 +133,7 @@ def run(command: Command, console: Console) -> int:
       Exit status.
     """
     wanted = command.config
+    machine.offer_devices(wanted.run.num_devices)
     path = wanted.run.dir or Path(distributed.gather(str(run_dir.default_path()))[0])
     maps = tuple(file.resolve() for file in wanted.run.maps)
     banks = tuple(file.resolve() for file in wanted.run.routes)

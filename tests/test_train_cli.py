@@ -6,6 +6,8 @@ import json
 import os
 import re
 import signal
+import subprocess
+import sys
 from pathlib import Path
 
 import jax
@@ -13,7 +15,7 @@ import numpy as np
 import pytest
 from helpers import once
 
-from carljax import build, checkpoint, config, metrics_log, run_dir, train
+from carljax import build, checkpoint, config, machine, metrics_log, run_dir, train
 from carljax.ppo import trainer
 from carljax.reward.config import RewardConfig
 from carljax.sim import towns
@@ -185,6 +187,30 @@ def test_a_run_without_a_checkpoint_begins_anew(tmp_path, monkeypatch):
     assert train.main([*TINY, "--run.dir", folder]) == 0
     assert train.main(["--resume", folder]) == 0
     assert begun == [0, 0]
+
+
+@pytest.mark.skipif(machine.num_cores() < 2, reason="needs two cores")
+def test_cores_of_a_cpu_are_devices_where_asked_for(tmp_path):
+    unforced = {k: v for k, v in os.environ.items() if k != "XLA_FLAGS"} | {"JAX_PLATFORMS": "cpu"}
+    for num, status, said in ((2, 0, "2 x cpu"), (1000, 2, "1000 devices were asked for")):
+        made = subprocess.run(
+            [
+                sys.executable,
+                "-m",
+                "carljax.train",
+                *TINY,
+                "--dry-run",
+                "--run.num-devices",
+                f"{num}",
+            ],
+            env=unforced,
+            cwd=tmp_path,
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        assert made.returncode == status, made.stderr
+        assert said in made.stdout + made.stderr
 
 
 def test_a_map_that_changed_is_not_continued_with(tmp_path):
