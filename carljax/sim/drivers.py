@@ -60,7 +60,10 @@ def accelerations(
     others, movers = once((others, movers))
     pair = priority.pairs(agents, focus, others, road_map)
     along = lane_gaps(agents, movers, road_map)
-    gap, leader_speed = leaders(jnp.minimum(along, priority.joined_gaps(pair)), movers)
+    joined = priority.joined_gaps(pair)
+    gap, leader_speed = _nearer(
+        leaders(along, movers.speed[:, None]), leaders(joined, pair.others.speed)
+    )
     half = 0.5 * agents.length
     room = priority.has_room(focus, half, along, movers)
     may_go = movers.can_go & jnp.append(room & ~_is_in_queue(along, movers), True)
@@ -140,13 +143,21 @@ def lane_gaps(agents: Agents, movers: Mover, road_map: RoadMap) -> jax.Array:
     return jnp.where((other >= 0) & (gap < FAR), gap - room, FAR)
 
 
-def leaders(gaps: jax.Array, movers: Mover) -> tuple[jax.Array, jax.Array]:
+def leaders(gaps: jax.Array, speed: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Bumper gap to, and speed of, the nearest car ahead: (N,) m, (N,) m/s.
 
     Args:
-      gaps: (M, N) m to everybody.
-      movers: (M,) everybody.
+      gaps: (R, N) m to others.
+      speed: (R, 1) or (R, N) m/s of those.
     """
     nearest = gaps.min(axis=0)
     # No search by index, which would cost more than all of the above.
-    return nearest, jnp.where(gaps == nearest, movers.speed[:, None], 0.0).max(axis=0)
+    return nearest, jnp.where(gaps == nearest, speed, 0.0).max(axis=0)
+
+
+def _nearer(
+    one: tuple[jax.Array, jax.Array], other: tuple[jax.Array, jax.Array]
+) -> tuple[jax.Array, jax.Array]:
+    """The nearer of two leaders, each as from `leaders`; of two equally near the faster."""
+    gap = jnp.minimum(one[0], other[0])
+    return gap, jnp.maximum(*(jnp.where(near == gap, speed, 0.0) for near, speed in (one, other)))

@@ -22,6 +22,7 @@ from carljax.sim.junctions import (
     MEETING_STEPS,
     MERGE,
 )
+from carljax.sim.once import once
 from carljax.sim.right_of_way import BRAKING, Mover, ahead_of
 from carljax.sim.road_map import RoadMap
 from carljax.sim.types import Agents
@@ -38,12 +39,17 @@ PATIENCE = 8.0  # s at rest after which nobody waits for a car that doesn't move
 FOLLOWS = 0.5  # s of headway given to a car before which an agent joins. source: ours
 SHORT = 12.0  # m; nobody waits for room on shorter lanes, such as in roundabouts. source: ours
 ROOM_GAP = 2.0  # m kept to it at rest. source: IDM's gap at rest
+# Of more than MANY cars each agent looks at the NEAREST of its own junction alone, so that cost
+# grows with their number and not with its square. source: ours; so many are never in each other's
+# way at once
+MANY, NEAREST = 64, 32
 
 
 class Crossers(struct.PyTreeNode):
     """Agents and, last, the ego, where lanes meet; all (M,), M = N + 1.
 
     Attributes:
+      number: int32, counted from 0.
       lane: int32, the junction's lane that it is on or has not wholly left, else the one it will
         take next; -1 for none.
       s: m of its middle along that lane, negative before its beginning, beyond its end after it.
@@ -54,6 +60,7 @@ class Crossers(struct.PyTreeNode):
       is_lawless: bool, drives and stops for nobody.
     """
 
+    number: jax.Array
     lane: jax.Array
     s: jax.Array
     speed: jax.Array
@@ -91,17 +98,18 @@ class Stretch(struct.PyTreeNode):
 
 
 class Pairs(struct.PyTreeNode):
-    """Every crosser (rows) against every agent's focus (columns), (M, N).
+    """Crossers (rows) against every agent's focus (columns), (R, N).
 
-    The agents come last since a CPU computes along the last axis, and what is looked for among the
-    others of each is then found for many agents at once.
+    The rows are all crossers, or of each column some: see `pairs`. The agents come last since a CPU
+    computes along the last axis, and what is looked for among the others of each is then found for
+    many agents at once.
 
     Attributes:
       owes: int32, FREE or one of the CONFLICT codes of `junctions`.
       merges, forks: bool, the lanes end, begin together.
       mine, theirs: the stretches on the lanes of both.
       focus: (N,) of each agent.
-      others: (M, 1) crossers.
+      others: (R, 1) or (R, N) crossers.
       speed, wait_s, half_length: (N,) of each agent.
     """
 
@@ -138,6 +146,7 @@ def crossers(agents: Agents, movers: Mover, road_map: RoadMap, top_speed: jax.Ar
     bend = road_map.lane_curve_speed[jnp.maximum(way, 0)]
     # The ego may be as fast as it likes.
     return Crossers(
+        number=jnp.arange(way.shape[0]),
         lane=way,
         s=jnp.where(is_in, movers.s, jnp.where(is_out, after, before)),
         speed=movers.speed,
@@ -178,18 +187,21 @@ def focus_of(agents: Agents, road_map: RoadMap, top_speed: jax.Array) -> Focus:
 
 
 def pairs(agents: Agents, focus: Focus, others: Crossers, road_map: RoadMap) -> Pairs:
-    """Looks up how each focus meets each lane of others."""
-    row, seen = jnp.maximum(focus.lane, 0), jnp.maximum(others.lane, 0)
-    slots = jnp.arange(road_map.lane_meeting.shape[-1])
-    is_slot = (road_map.lane_slot[seen][:, None] == slots).astype(jnp.float32)  # (M, J)
-    # A product of matrices that picks single numbers, exactly; a look-up for each pair within what
-    # follows would keep the compiler from vectorising all of it on a CPU.
-    found = jnp.einsum(
-        "mj,ncj->cmn", is_slot, road_map.lane_meeting[row], precision=jax.lax.Precision.HIGHEST
-    )
-    same = road_map.lane_junction[seen][:, None] == road_map.lane_junction[row]
-    same &= (others.lane >= 0)[:, None] & (focus.lane >= 0)
-    mine, theirs = jnp.where(same, found.astype(jnp.int32), 0)
+    """Looks up how each focus meets each lane of others.
+
+    Of more than `MANY` others these are for each focus the `NEAREST` of its junction.
+    """
+    if others.lane.shape[0] > MANY:
+        others = once(_nearest(focus, others, road_map))
+        slot = road_map.lane_slot[jnp.maximum(others.lane, 0)]
+        meeting = once(road_map.lane_meeting[jnp.maximum(focus.lane, 0), :, slot])
+        found = (meeting[..., 0], meeting[..., 1])
+    else:
+        found = tuple(_meetings(focus, others, road_map))
+        others = jax.tree.map(lambda x: x[:, None], others)
+    junction = _junction(others.lane, road_map)
+    same = (junction >= 0) & (junction == _junction(focus.lane, road_map))
+    mine, theirs = (jnp.where(same, number.astype(jnp.int32), 0) for number in found)
     relation = (mine >> 2) & 3
     return Pairs(
         owes=mine & 3,
@@ -198,11 +210,46 @@ def pairs(agents: Agents, focus: Focus, others: Crossers, road_map: RoadMap) -> 
         mine=_stretch((mine >> 4) & MEETING_MASK, mine >> 14),
         theirs=_stretch(theirs & 0xFFF, theirs >> 12),
         focus=focus,
-        others=jax.tree.map(lambda x: x[:, None], others),
+        others=others,
         speed=agents.speed,
         wait_s=agents.wait_s,
         half_length=0.5 * agents.length,
     )
+
+
+def _junction(lane: jax.Array, road_map: RoadMap) -> jax.Array:
+    """Int32 junctions of lanes, -1 for no lane."""
+    return jnp.where(lane >= 0, road_map.lane_junction[jnp.maximum(lane, 0)], -1)
+
+
+def _meetings(focus: Focus, others: Crossers, road_map: RoadMap) -> jax.Array:
+    """(2, M, N) float32, `lane_meeting` of each focus and each other."""
+    slots = jnp.arange(road_map.lane_meeting.shape[-1])
+    slot = road_map.lane_slot[jnp.maximum(others.lane, 0)]
+    is_slot = (slot[:, None] == slots).astype(jnp.float32)  # (M, J)
+    # A product of matrices that picks single numbers, exactly; a look-up for each pair within what
+    # follows would keep the compiler from vectorising all of it on a CPU.
+    return jnp.einsum(
+        "mj,ncj->cmn",
+        is_slot,
+        road_map.lane_meeting[jnp.maximum(focus.lane, 0)],
+        precision=jax.lax.Precision.HIGHEST,
+    )
+
+
+def _nearest(focus: Focus, others: Crossers, road_map: RoadMap) -> Crossers:
+    """(NEAREST, N) crossers of each focus's junction: the farthest on their way come first.
+
+    Where they are fewer, others follow, which are of other junctions or of none.
+    """
+    junction = _junction(others.lane, road_map)
+    sort = jax.lax.sort((junction, -others.s, others.number), num_keys=2)
+    first = jnp.searchsorted(sort[0], _junction(focus.lane, road_map), method="scan_unrolled")
+    place = first + jnp.arange(NEAREST)[:, None]
+    number = sort[2][jnp.minimum(place, junction.shape[0] - 1)]
+    found = jax.tree.map(lambda x: x[number], others)
+    # The last one of all only once.
+    return found.replace(lane=jnp.where(place < junction.shape[0], found.lane, -1))
 
 
 def _stretch(enter: jax.Array, leave: jax.Array) -> Stretch:
@@ -211,7 +258,7 @@ def _stretch(enter: jax.Array, leave: jax.Array) -> Stretch:
 
 
 def joined_gaps(pair: Pairs) -> jax.Array:
-    """(M, N) m, bumper gap to cars on lanes that begin or end with an agent's own, FAR elsewhere.
+    """(R, N) m, bumper gap to cars on lanes that begin or end with an agent's own, FAR elsewhere.
 
     Where lanes part, to the one ahead until its tail is clear; where they join, to the one that is
     nearer to where they end.
@@ -281,22 +328,28 @@ def gated(pair: Pairs, may_go: jax.Array) -> jax.Array:
     has_entered = front > ENTERED
     there = (front > theirs.enter) & (others.s - others.half_length < theirs.leave)
     # Two that wait for one another would wait for ever: the one that waited longest goes.
-    mine, other = _order(pair)
-    first = (pair.wait_s > others.wait_s) | ((pair.wait_s == others.wait_s) & (mine < other))
+    first = pair.wait_s > others.wait_s
+    first |= (pair.wait_s == others.wait_s) & (_order(pair) < others.number)
     stands = (pair.wait_s > PATIENCE) & (others.speed < 0.5) & ~others.is_lawless
     inside = has_entered & (others.s - others.half_length < theirs.leave) & ~_joins(pair)
     inside &= (_leaves(pair) + 0.5 * MARGIN > _arrives(pair)) & (there | ~stands)
     margin = jnp.clip(MARGIN * PATIENCE / (PATIENCE + pair.wait_s), LEAST_MARGIN, MARGIN)
     yields = (pair.owes == CONFLICT_YIELD) | others.is_lawless
     yields |= (pair.owes == CONFLICT) & _is_earlier(pair)
-    coming = ~has_entered & may_go[:, None] & yields & _collides(pair, margin)
+    coming = ~has_entered & _of_others(pair, may_go) & yields & _collides(pair, margin)
     waits = (pair.owes != FREE) & (inside | (coming & ~(stands & first)))
     return waits.any(axis=0) & (focus.front < ENTERED)
 
 
-def _order(pair: Pairs) -> tuple[jax.Array, jax.Array]:
-    """(N,) agents and (M, 1) others, numbered: the first goes first if all else is equal."""
-    return jnp.arange(pair.speed.shape[0]), jnp.arange(pair.others.s.shape[0])[:, None]
+def _of_others(pair: Pairs, values: jax.Array) -> jax.Array:
+    """(R, 1) or (R, N): values (M,) of all crossers for those that are looked at."""
+    is_all = pair.others.number.shape[1] == 1
+    return values[:, None] if is_all else values[pair.others.number]
+
+
+def _order(pair: Pairs) -> jax.Array:
+    """(N,) int32 numbers of the agents among the crossers: the first goes if all else is equal."""
+    return jnp.arange(pair.speed.shape[0])
 
 
 def _is_earlier(pair: Pairs) -> jax.Array:
@@ -305,8 +358,7 @@ def _is_earlier(pair: Pairs) -> jax.Array:
     mine = jnp.maximum(-focus.front, 0.0) / jnp.maximum(pair.speed, 2.0) - pair.wait_s
     other = jnp.maximum(-others.s - others.half_length, 0.0) / jnp.maximum(others.speed, 2.0)
     other = other - others.wait_s
-    my_order, other_order = _order(pair)
-    return (other < mine) | ((other == mine) & (other_order < my_order))
+    return (other < mine) | ((other == mine) & (others.number < _order(pair)))
 
 
 def _collides(pair: Pairs, margin: jax.Array | float) -> jax.Array:
@@ -321,13 +373,13 @@ def _collides(pair: Pairs, margin: jax.Array | float) -> jax.Array:
 
 
 def _arrives(pair: Pairs) -> jax.Array:
-    """(M, N) s until an agent comes to the stretch."""
+    """(R, N) s until an agent comes to the stretch."""
     to_go = pair.mine.enter - pair.focus.front
     return _time(to_go, pair.speed, pair.focus.top_speed)
 
 
 def _leaves(pair: Pairs) -> jax.Array:
-    """(M, N) s until the other car has left the stretch if it goes on as now."""
+    """(R, N) s until the other car has left the stretch if it goes on as now."""
     others = pair.others
     left = pair.theirs.leave - others.s + others.half_length
     return jnp.maximum(left, 0.0) / jnp.maximum(others.speed, SLOWEST)

@@ -1,6 +1,11 @@
 """Where lanes meet: stretches by hand, whom to follow from lane to lane, and room beyond."""
 
+import dataclasses
+import functools
+import types
+
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from traffic_world import (
@@ -8,6 +13,7 @@ from traffic_world import (
     EGO_LENGTH,
     STEPS,
     cars,
+    drive,
     ego_place,
     enters_at,
     f32,
@@ -111,6 +117,41 @@ def test_follows_whoever_is_nearer_to_where_lanes_join(world):
     got = joined_jit(agents, world.map)
     np.testing.assert_allclose(got[1, 0], 12.0 - 4.457 - 4.0, atol=0.26)
     assert got[0, 1] > 900
+
+
+def test_of_many_only_those_of_the_same_junction_are_looked_at(world, monkeypatch):
+    ways = [world.way("plain", arm, way) for arm in ALL for way in ("straight", "left")]
+    agents = cars(
+        world,
+        *({"lanes": way, "lane_s": 50.0 + 3.0 * k, "speed": 6.0} for k, way in enumerate(ways)),
+    )
+    given = (world.map, agents, f32(0.0), jax.random.key(0), make_ego(), ego_place())
+    full = jax.jit(functools.partial(drive, num_steps=STEPS))(*given)
+    assert full.wait_s.max() > 2.0 and full.lane_s[-1].std() > 1.0  # some had to wait
+    monkeypatch.setattr(priority, "MANY", 4)
+    some = jax.jit(functools.partial(drive, num_steps=STEPS))(*given)
+    for name in ("lane_s", "speed", "wait_s", "lanes"):
+        np.testing.assert_allclose(getattr(some, name), getattr(full, name), atol=1e-3)
+
+
+def test_of_a_crowded_junction_the_nearest_are_looked_at():
+    num, rng = 120, np.random.default_rng(0)
+    lane = rng.integers(-1, 8, num).astype(np.int32)
+    s = rng.uniform(-40.0, 15.0, num).astype(np.float32)
+    rest = {f.name: np.zeros(num, np.float32) for f in dataclasses.fields(priority.Crossers)}
+    others = priority.Crossers(**{**rest, "number": np.arange(num), "lane": lane, "s": s})
+    junction = np.array([0, 0, 0, 0, 0, 0, -1, 1], np.int32)  # of lanes
+    road_map = types.SimpleNamespace(lane_junction=jnp.asarray(junction))
+    focus = types.SimpleNamespace(lane=jnp.array([7, 2]))
+    got = priority._nearest(focus, jax.tree.map(jnp.asarray, others), road_map)
+    for column, number in ((0, 1), (1, 0)):
+        there = np.flatnonzero((lane >= 0) & (junction[lane] == number))
+        want = there[np.argsort(-s[there])][: priority.NEAREST]
+        seen = np.asarray(got.lane[:, column])
+        mine = (seen >= 0) & (junction[seen] == number)
+        np.testing.assert_array_equal(np.asarray(got.number[:, column])[mine], want)
+        np.testing.assert_array_equal(np.asarray(got.s[:, column])[mine], s[want])
+    assert (junction[lane[lane >= 0]] == 0).sum() > priority.NEAREST
 
 
 @pytest.mark.parametrize(

@@ -185,7 +185,8 @@ def _pairs(agents, movers, road_map):
 def leaders_jit(agents, stop, ego, place, road_map):
     clock = lights.clock(f32(0.0), 0)
     movers = right_of_way.all_movers(agents, stop, ego, f32(EGO_LENGTH), place, road_map, clock)
-    return drivers.leaders(drivers.lane_gaps(agents, movers, road_map), movers)
+    gaps = drivers.lane_gaps(agents, movers, road_map)
+    return drivers.leaders(gaps, movers.speed[:, None])
 
 
 @jax.jit
