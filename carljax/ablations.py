@@ -150,7 +150,7 @@ ABLATIONS: dict[str, Ablation] = {
             Cell("convolutions", {"network.encoder": "carl"}),
             Cell("256 environments", {"ppo.num_envs": 256}),
             Cell("batch of 128 steps", {"ppo.num_steps": 128}),
-            Cell("2 epochs", {"ppo.update_epochs": 2}),
+            Cell("3 epochs, minibatch 1024", {"ppo.update_epochs": 3, "ppo.num_minibatches": 8}),
         ),
         preset="cpu",
     ),
