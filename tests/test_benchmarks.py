@@ -322,6 +322,7 @@ def test_a_presets_sizes_can_be_changed():
     config = throughput.configure(throughput.Command(num_envs=256))
     assert config.ppo.num_envs == 256
     assert config.ppo.num_steps == presets.CPU.ppo.num_steps
-    # Four devices have 1,024 / 8 = 128 samples each of a minibatch.
-    command = throughput.Command(kinds=("end_to_end",), num_envs=64, num_devices=4)
-    assert throughput.configure(command).ppo.micro_batch_size == 128
+    # Eight devices have 32 x 512 / 4 / 8 = 512 samples each of a minibatch.
+    made = {"preset": "carl-carla", "kinds": ("end_to_end",)}
+    command = throughput.Command(**made, num_envs=32, num_devices=8)
+    assert throughput.configure(command).ppo.micro_batch_size == 512
