@@ -137,11 +137,6 @@ class Poses(NamedTuple):
     cos: jax.Array
     sin: jax.Array
 
-    def moved(self, ahead: jax.Array | float, left: jax.Array | float) -> Poses:
-        """Poses so many px ahead of and to the left of these, in the same direction."""
-        row = self.row - self.cos * ahead + self.sin * left
-        return self._replace(row=row, column=self.column - self.sin * ahead - self.cos * left)
-
 
 def poses(xy: jax.Array, yaw: jax.Array, ego: EgoState, config: RasterConfig) -> Poses:
     """Poses on the image.
@@ -154,6 +149,12 @@ def poses(xy: jax.Array, yaw: jax.Array, ego: EgoState, config: RasterConfig) ->
     """
     turn = yaw - ego.yaw
     return once(Poses(*pixel(xy, ego, config), jnp.cos(turn), jnp.sin(turn)))
+
+
+def moved(at: Poses, ahead: jax.Array | float, left: jax.Array | float) -> Poses:
+    """Poses so many px ahead of and to the left of others, in the same direction."""
+    row = at.row - at.cos * ahead + at.sin * left
+    return at._replace(row=row, column=at.column - at.sin * ahead - at.cos * left)
 
 
 def box_pixels(

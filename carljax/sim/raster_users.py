@@ -10,7 +10,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from carljax.sim.raster_canvas import Poses, RasterConfig, box_pixels, poses, ray_pixels
+from carljax.sim.raster_canvas import (
+    Poses,
+    RasterConfig,
+    box_pixels,
+    moved,
+    poses,
+    ray_pixels,
+)
 from carljax.sim.raster_marks import draw
 from carljax.sim.types import (
     DOOR_FRONT_LEFT,
@@ -154,7 +161,7 @@ def _forecast_lines(
     front = 0.5 * jnp.maximum(agents.length, 2 * HALF_EXTENT_MIN) * config.pixels_per_metre
     reach = jnp.where(moves, jnp.maximum(agents.speed * FORECAST_S, FORECAST_MIN), -1.0)
     longest = (SPEED_RANGE - SPEED_OFFSET) * FORECAST_S
-    return draw(canvas, ray_pixels(at.moved(front, 0.0), reach, longest, config), code)
+    return draw(canvas, ray_pixels(moved(at, front, 0.0), reach, longest, config), code)
 
 
 def _doors(
@@ -205,7 +212,7 @@ def _parts(
       (len(places) * N, S) int32 flat pixel indices, bit by bit.
     """
     px = config.pixels_per_metre
-    middles = [at.moved(ahead * px, left * px) for ahead, left in places.values()]
+    middles = [moved(at, ahead * px, left * px) for ahead, left in places.values()]
     lit = jnp.concatenate([shown & ((signals & bit) > 0) for bit in places])
     middle = jax.tree.map(lambda *x: jnp.concatenate(x), *middles)
     along, across = (jnp.full(lit.shape, extent) for extent in size)
