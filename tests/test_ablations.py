@@ -63,8 +63,8 @@ def test_tables_change_what_they_say():
 
 
 def test_a_minibatch_that_cannot_be_reached_is_refused():
-    with pytest.raises(ConfigError, match="odd: 8 minibatches of 100 samples"):
-        ablations.configure(Cell("odd", minibatch=100), CPU, 1000)
+    with pytest.raises(ConfigError, match="odd: 32 minibatches of 99 samples"):
+        ablations.configure(Cell("odd", minibatch=99), CPU, 1000)
 
 
 def test_values_are_multiplied_and_whole_numbers_stay_whole():
