@@ -42,7 +42,7 @@ ROOM_GAP = 2.0  # m kept to it at rest. source: IDM's gap at rest
 # Of more than MANY cars each agent looks at the NEAREST of its own junction alone, so that cost
 # grows with their number and not with its square. source: ours; so many are never in each other's
 # way at once
-MANY, NEAREST = 64, 32
+MANY, NEAREST = 96, 32
 
 
 class Crossers(struct.PyTreeNode):
