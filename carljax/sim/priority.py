@@ -218,7 +218,7 @@ def pairs(agents: Agents, focus: Focus, others: Crossers, road_map: RoadMap) -> 
 
 
 def _junction(lane: jax.Array, road_map: RoadMap) -> jax.Array:
-    """Int32 junctions of lanes, -1 for no lane."""
+    """Junctions of lanes, int32; -1 for no lane and outside of junctions."""
     return jnp.where(lane >= 0, road_map.lane_junction[jnp.maximum(lane, 0)], -1)
 
 
