@@ -9,6 +9,8 @@ ends. Nobody enters who could not leave again.
 
 from __future__ import annotations
 
+import functools
+
 import jax
 import jax.numpy as jnp
 from flax import struct
@@ -197,7 +199,7 @@ def pairs(agents: Agents, focus: Focus, others: Crossers, road_map: RoadMap) -> 
         meeting = once(road_map.lane_meeting[jnp.maximum(focus.lane, 0), :, slot])
         found = (meeting[..., 0], meeting[..., 1])
     else:
-        found = tuple(_meetings(focus, others, road_map))
+        found = _meetings(focus, others, road_map)
         others = jax.tree.map(lambda x: x[:, None], others)
     junction = _junction(others.lane, road_map)
     same = (junction >= 0) & (junction == _junction(focus.lane, road_map))
@@ -222,19 +224,17 @@ def _junction(lane: jax.Array, road_map: RoadMap) -> jax.Array:
     return jnp.where(lane >= 0, road_map.lane_junction[jnp.maximum(lane, 0)], -1)
 
 
-def _meetings(focus: Focus, others: Crossers, road_map: RoadMap) -> jax.Array:
-    """(2, M, N) float32, `lane_meeting` of each focus and each other."""
+def _meetings(focus: Focus, others: Crossers, road_map: RoadMap) -> tuple[jax.Array, jax.Array]:
+    """(M, N) float32, both numbers of `lane_meeting` of each focus and each other."""
     slots = jnp.arange(road_map.lane_meeting.shape[-1])
     slot = road_map.lane_slot[jnp.maximum(others.lane, 0)]
     is_slot = (slot[:, None] == slots).astype(jnp.float32)  # (M, J)
     # A product of matrices that picks single numbers, exactly; a look-up for each pair within what
     # follows would keep the compiler from vectorising all of it on a CPU.
-    return jnp.einsum(
-        "mj,ncj->cmn",
-        is_slot,
-        road_map.lane_meeting[jnp.maximum(focus.lane, 0)],
-        precision=jax.lax.Precision.HIGHEST,
-    )
+    table = road_map.lane_meeting[jnp.maximum(focus.lane, 0)]  # (N, 2, J)
+    # Two products, lest both numbers come out with M last, and have to be transposed.
+    pick = functools.partial(jnp.einsum, "mj,nj->mn", precision=jax.lax.Precision.HIGHEST)
+    return pick(is_slot, table[:, 0]), pick(is_slot, table[:, 1])
 
 
 def _nearest(focus: Focus, others: Crossers, road_map: RoadMap) -> Crossers:
