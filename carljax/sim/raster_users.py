@@ -174,7 +174,8 @@ def _doors(
 ) -> jax.Array:
     """Open doors, coded as the vehicle is."""
     is_open = shown & (agents.signals >= min(DOORS))
-    is_open, row = jax.lax.top_k(is_open.astype(jnp.int32), min(NUM_OPEN, len(shown)))
+    # Of float32, since XLA:CPU sorts integers whole.
+    is_open, row = jax.lax.top_k(is_open.astype(jnp.float32), min(NUM_OPEN, len(shown)))
     at, signals, code = jax.tree.map(lambda x: x[row], (at, agents.signals, code))
     pixels = _parts(at, signals, is_open > 0, DOORS, (DOOR_LENGTH, DOOR_WIDTH), config)
     return draw(canvas, pixels, jnp.tile(code, len(DOORS)))
