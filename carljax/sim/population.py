@@ -7,7 +7,7 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 
-from carljax.sim.scenarios.script import NUM_CARS, NUM_OTHERS
+from carljax.sim.scenarios import script
 from carljax.sim.types import KIND_NONE, Agents, Walkers
 
 
@@ -27,13 +27,13 @@ class Population:
 
     @property
     def num_vehicles(self) -> int:
-        """Rows that drive on lanes: traffic, then NUM_CARS of each slot."""
-        return self.num_traffic + self.num_slots * NUM_CARS
+        """Rows that drive on lanes: traffic, then the scenarios' cars."""
+        return self.num_traffic + script.num_cars(self.num_slots)
 
     @property
     def num_agents(self) -> int:
         """N, all rows."""
-        return self.num_vehicles + self.num_slots * NUM_OTHERS + self.num_walkers
+        return self.others.stop + self.num_walkers
 
     @property
     def traffic(self) -> slice:
@@ -47,13 +47,13 @@ class Population:
 
     @property
     def cars(self) -> slice:
-        """Rows of the scenarios' cars, (num_slots * NUM_CARS), slot by slot."""
+        """Rows of the scenarios' cars, see `ScenarioSlots.cars`."""
         return slice(self.num_traffic, self.num_vehicles)
 
     @property
     def others(self) -> slice:
-        """Rows of the scenarios' other actors, (num_slots * NUM_OTHERS), slot by slot."""
-        return slice(self.num_vehicles, self.num_vehicles + self.num_slots * NUM_OTHERS)
+        """Rows of the scenarios' other actors, see `ScenarioSlots.others`."""
+        return slice(self.num_vehicles, self.num_vehicles + script.num_others(self.num_slots))
 
     @property
     def walkers(self) -> slice:

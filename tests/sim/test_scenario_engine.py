@@ -236,10 +236,37 @@ def test_at_the_start_whoever_is_near_may_appear_in_sight(road_map):
     third = PLAIN | {"arm_s": 0.0, "trigger_s": 50.0, "others": walker(70.0)}
     world = World(road_map, near, second, third, at_start=True)
     assert world.slots.index.tolist() == [0, 1] and world.slots.next_index == 2
-    assert [world.x(OTHER), world.x(OTHER + NUM_OTHERS)] == [30.0, 60.0]
+    assert [world.x(OTHER), world.x(OTHER + 1)] == [30.0, 60.0]
     occupied = World(road_map, near).put(0, 30.0, y=-5.0)
     occupied.start()
     assert occupied.slots.next_index == 0
+
+
+def test_scenarios_share_the_rows_of_cars(road_map):
+    def cars(num):
+        # At the trigger, and far from one another and from the ego.
+        return {
+            "model": [0] * num,
+            "lanes": [(2, -1, -1)] * num,
+            "s": [20.0 * k for k in range(num)],
+            "from_trigger": [True] * num,
+        }
+
+    plain = {"arm_s": 20.0, "end_s": 70.0, "timeout_s": 30.0}
+    first = plain | {"trigger_s": 30.0, "cars": cars(4)}
+    small = plain | {"trigger_s": 400.0, "end_s": 450.0, "cars": cars(2)}
+    large = plain | {"trigger_s": 400.0, "end_s": 450.0, "cars": cars(3)}
+    world = World(road_map, first, small).at(25.0, steps=2)
+    assert world.slots.cars.slot.tolist() == [0, 0, 0, 0, 1, 1]
+    assert world.slots.cars.number.tolist() == [0, 1, 2, 3, 0, 1]
+    world = World(road_map, first, large).at(25.0, steps=2)
+    assert world.slots.index.tolist() == [0, -1] and world.slots.next_index == 1  # 2 rows for 3
+    world.at(35.0, steps=4)
+    assert world.kinds(CAR, 6) == [KIND_VEHICLE] * 4 + [KIND_NONE] * 2
+    world.at(71.0, steps=2)  # over; nobody sees the cars beyond 300 m
+    assert world.slots.index.tolist() == [1, -1]
+    assert (world.slots.cars.slot >= 0).sum() == 3
+    assert world.kinds(CAR, 6) == [KIND_NONE] * 6  # those of the second come at its trigger
 
 
 def test_a_full_house_waits_and_then_takes_over_who_is_leaving(road_map):
@@ -257,7 +284,7 @@ def test_a_full_house_waits_and_then_takes_over_who_is_leaving(road_map):
     assert world.slots.next_index == 2
     world.at(72.0)
     assert world.slots.index.tolist() == [2, 1] and not world.slots.is_leaving.any()
-    assert [world.x(OTHER), world.x(OTHER + NUM_OTHERS)] == [180.0, 120.0]
+    assert [world.x(OTHER), world.x(OTHER + 1)] == [180.0, 120.0]
 
 
 # Playing
@@ -274,7 +301,7 @@ def test_others_start_in_time_move_and_stand(road_map):
     assert world.slots.is_playing.tolist() == [True, False] and world.slots.num_triggered == 1
     assert not world.slots.has_started.any() and world.agents.signals[OTHER] == 0
     world.at(105.1, speed=10.0)
-    assert world.slots.has_started[0].tolist() == [True, False, False]
+    assert world.slots.has_started.tolist() == [True, False, False, False]
     np.testing.assert_allclose(world.agents.xy[OTHER], (-80.0, -4.8), atol=1e-4)  # 0.2 m on
     assert world.agents.speed[OTHER] == 2.0 and world.agents.signals[OTHER] == SIGNAL_LEFT
     world.at(106.0, speed=0.0, steps=9)  # it goes on whatever the ego does: 10 steps are 2 m
@@ -290,7 +317,7 @@ def test_others_start_when_the_ego_is_near_or_stands(road_map):
     world.at(113.9, speed=0.0)  # 6.1 m: at 0.5 m/s, the least, 12 s
     assert not world.slots.has_started.any()
     world.at(114.1, speed=0.0)
-    assert world.slots.has_started[0, 0]
+    assert world.slots.has_started[0]
 
 
 def test_whoever_is_struck_from_the_list_does_not_come_back(road_map):

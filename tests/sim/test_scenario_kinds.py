@@ -129,9 +129,7 @@ def test_the_pedestrian_comes_from_behind_the_box(worlds, passive):
     others = env.bank.scenarios.others
     assert (np.asarray(others.kind)[:, 0, :2] == [KIND_PEDESTRIAN, KIND_STATIC]).all()
     walker, box = (sim.agents.xy[:, :, OTHER + k].astype(float) for k in (0, 1))
-    stood = (sim.agents.kind[:, :, OTHER] == KIND_PEDESTRIAN) & ~sim.scenarios.has_started[
-        ..., 0, 0
-    ]
+    stood = (sim.agents.kind[:, :, OTHER] == KIND_PEDESTRIAN) & ~sim.scenarios.has_started[..., 0]
     np.testing.assert_allclose(np.hypot(*(walker - box)[stood].T), 1.0, atol=1e-3)
     # On the pavement: no lane of the road within 1 m of its middle, and the road within 5 m.
     width = 3.5 / 2

@@ -1,12 +1,10 @@
 """The actors of scenarios: cars that drive on lanes, and others that stand and move straight on.
 
 Traffic moves the cars, as all that is on lanes; here they are told how to drive, take their places
-and are taken away. Rows are flat: slot by slot, NUM_CARS or NUM_OTHERS of each.
+and are taken away. Which rows are whose, `parts` says.
 """
 
 from __future__ import annotations
-
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -65,11 +63,6 @@ class Cues(struct.PyTreeNode):
 
     is_active: jax.Array
     triggered_s: jax.Array
-
-
-def flat(script: Any) -> Any:
-    """Scripts of actors, slot by slot: (H, n, ...) to (H * n, ...)."""
-    return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), script)
 
 
 def is_hidden(xy: jax.Array, scene: Scene) -> jax.Array:

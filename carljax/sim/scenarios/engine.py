@@ -1,12 +1,15 @@
 """Plays the scenarios of a route: one engine for all kinds, everything in fixed slots.
 
-When the ego comes to a scenario's `arm_s` its actors take their places, if nobody sees them appear
-and nobody is in their place; else the scenario waits, and is left out once its trigger is passed.
+When the ego comes to a scenario's `arm_s` its actors take their places, if there are rows for them
+(`parts`), nobody sees them appear and nobody is in their place; else the scenario waits, and is
+left out once its trigger is passed.
 From the trigger on it plays, until the ego is past its end or its time is up. Then its actors leave
 as soon as nobody sees them, and the slot is free.
 """
 
 from __future__ import annotations
+
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -14,13 +17,12 @@ from flax import struct
 
 from carljax.sim import geometry, population
 from carljax.sim.route import Route
-from carljax.sim.scenarios import actors
+from carljax.sim.scenarios import actors, parts
 from carljax.sim.scenarios.actors import Cues, Scene
+from carljax.sim.scenarios.parts import Parts
 from carljax.sim.scenarios.script import (
     DRIVE_FLOW,
     DRIVE_MEET,
-    NUM_CARS,
-    NUM_OTHERS,
     Scenario,
     ScenarioSlots,
 )
@@ -152,7 +154,7 @@ def step(
 
 
 class Cast(struct.PyTreeNode):
-    """The rows of all scenarios: cars (H * NUM_CARS,), others (H * NUM_OTHERS,)."""
+    """The rows of all scenarios: cars (P,), others (Q,)."""
 
     cars: Agents
     others: Agents
@@ -182,36 +184,60 @@ def _arm(
     """Gives the next scenario a slot, if it is time and its actors can take their places.
 
     Returns:
-      The slots, what is played in them (H,), and their actors.
+      The slots, what is played in them (see `_in_play`), and their actors.
     """
     coming = scripts(scenarios, episode_idx, slots.next_index)
     free = slots.index < 0
     slot = jnp.argmax(2 * free + slots.is_leaving)
+    num_cars, num_others = (coming.cars.model >= 0).sum(), (coming.others.kind != KIND_NONE).sum()
     exists = coming.kind >= 0
     missed = exists & (scene.route_s > coming.trigger_s + LATE)
     arms = exists & ~missed & (scene.route_s >= coming.arm_s)
     arms &= (free | slots.is_leaving)[slot] & _has_room(coming, agents, scene)
+    arms &= parts.num_free(slots.cars, slot) >= num_cars
+    arms &= parts.num_free(slots.others, slot) >= num_others
     taken = arms & (jnp.arange(scene.rows.num_slots) == slot)
     noise = jax.random.uniform(key, slots.noise.shape, minval=-1.0)
+    cars, changed_cars = parts.hand_over(slots.cars, taken, num_cars)
+    others, changed_others = parts.hand_over(slots.others, taken, num_others)
     slots = slots.replace(
         index=jnp.where(taken, slots.next_index, slots.index),
         is_leaving=slots.is_leaving & ~taken,
         triggered_s=jnp.where(taken, -1.0, slots.triggered_s),
-        has_appeared=slots.has_appeared & ~taken[:, None],
-        has_started=slots.has_started & ~taken[:, None],
-        moved=jnp.where(taken[:, None], 0.0, slots.moved),
+        cars=cars,
+        others=others,
+        has_appeared=slots.has_appeared & ~changed_cars,
+        has_started=slots.has_started & ~changed_others,
+        moved=jnp.where(changed_others, 0.0, slots.moved),
         noise=jnp.where(taken[:, None, None], noise, slots.noise),
         braker=jnp.where(taken, -1, slots.braker),
         braked_s=jnp.where(taken, 0.0, slots.braked_s),
         next_index=slots.next_index + (arms | missed),
     )
-    script = scripts(scenarios, episode_idx, slots.index)
-    appears = jnp.repeat(taken, NUM_OTHERS)
+    script = _in_play(slots, scenarios, episode_idx)
     cast = Cast(
-        actors.take_away(cast.cars, jnp.repeat(taken, NUM_CARS)),
-        actors.put_others(cast.others, appears, actors.flat(script.others)),
+        actors.take_away(cast.cars, changed_cars),
+        actors.put_others(cast.others, changed_others, script.others),
     )
     return slots, script, cast
+
+
+def _in_play(slots: ScenarioSlots, scenarios: Scenario, episode_idx: jax.Array) -> Scenario:
+    """What is played in the slots, (H,); in its cars and others the scripts of rows, (P,) (Q,).
+
+    Free rows are told that there is nobody.
+    """
+    script = scripts(scenarios, episode_idx, slots.index)
+
+    def of_rows(actors: Any, rows: Parts) -> Any:
+        index = jnp.maximum(slots.index, 0)[jnp.maximum(rows.slot, 0)]
+        return jax.tree.map(lambda x: x[episode_idx, index, rows.number], actors)
+
+    cars, others = of_rows(scenarios.cars, slots.cars), of_rows(scenarios.others, slots.others)
+    return script.replace(
+        cars=cars.replace(model=jnp.where(slots.cars.is_free, -1, cars.model)),
+        others=others.replace(kind=jnp.where(slots.others.is_free, KIND_NONE, others.kind)),
+    )
 
 
 def _has_room(coming: Scenario, agents: Agents, scene: Scene) -> jax.Array:
@@ -256,10 +282,9 @@ def _end(
     ends = over & (jnp.cumsum(over) == 1)
     cars = cast.cars
     behind = geometry.to_frame(cars.xy, scene.ego.xy, scene.ego.yaw)[:, 0] < 0.0
-    flat = actors.flat(script.cars)
     # Nobody can give way to one that crosses: only what comes along the ego's own way counts.
-    flashes = ((flat.signals & SIGNAL_EMERGENCY) > 0) & (flat.drive != DRIVE_MEET)
-    follows = (cars.valid & behind & flashes).reshape(-1, NUM_CARS).any(axis=1)
+    flashes = ((script.cars.signals & SIGNAL_EMERGENCY) > 0) & (script.cars.drive != DRIVE_MEET)
+    follows = parts.any_of(slots.cars, cars.valid & behind & flashes, len(ends))
     slots = slots.replace(
         is_leaving=slots.is_leaving | ends,
         ended_kind=jnp.where(ends, script.kind, -1).max(),
@@ -274,33 +299,27 @@ def _others(
     slots: ScenarioSlots, script: Scenario, cast: Cast, scene: Scene, dt: float
 ) -> tuple[ScenarioSlots, Cast]:
     """Lets those off the lanes start, and moves them."""
-    flat = actors.flat(script.others)
-    starts = actors.starts_moving(flat, _cues(slots, NUM_OTHERS), scene)
-    started = slots.has_started | starts.reshape(slots.has_started.shape)
-    others, moved = actors.move_others(
-        cast.others, flat, started.reshape(-1), slots.moved.reshape(-1), dt
-    )
-    slots = slots.replace(has_started=started, moved=moved.reshape(slots.moved.shape))
-    return slots, cast.replace(others=others)
+    starts = actors.starts_moving(script.others, _cues(slots, slots.others), scene)
+    started = slots.has_started | starts
+    others, moved = actors.move_others(cast.others, script.others, started, slots.moved, dt)
+    return slots.replace(has_started=started, moved=moved), cast.replace(others=others)
 
 
 def _cars(
     slots: ScenarioSlots, script: Scenario, cast: Cast, agents: Agents, scene: Scene
 ) -> tuple[ScenarioSlots, Cast]:
     """Lets cars on lanes take their places when it is their turn, and tells them how to drive."""
-    cars = cast.cars
-    flat, cues = actors.flat(script.cars), _cues(slots, NUM_CARS)
-    came = actors.way(cars, flat, scene.road_map)
-    waits = actors.waiting(cars, slots.has_appeared.reshape(-1), flat, cues, came)
-    at = actors.car_start(flat, scene.road_map)
+    cars, role, cues = cast.cars, script.cars, _cues(slots, slots.cars)
+    came = actors.way(cars, role, scene.road_map)
+    waits = actors.waiting(cars, slots.has_appeared, role, cues, came)
+    at = actors.car_start(role, scene.road_map)
     vehicles = population.rows(agents, scene.rows.vehicles)
-    able = actors.may_appear(at.xy, actors.car_length(flat), actors.CAR_GAP, vehicles, scene)
+    able = actors.may_appear(at.xy, actors.car_length(role), actors.CAR_GAP, vehicles, scene)
     able &= ~cars.valid | actors.is_hidden(cars.xy, scene)
     starts = actors.one_at_a_time(at.xy, waits & able)
-    cars = actors.put_cars(cars, starts, flat, at, scene.road_map)
-    cars = actors.command_cars(cars, flat, cues, jnp.where(starts, flat.s, came), scene)
-    appeared = slots.has_appeared | starts.reshape(slots.has_appeared.shape)
-    return slots.replace(has_appeared=appeared), cast.replace(cars=cars)
+    cars = actors.put_cars(cars, starts, role, at, scene.road_map)
+    cars = actors.command_cars(cars, role, cues, jnp.where(starts, role.s, came), scene)
+    return slots.replace(has_appeared=slots.has_appeared | starts), cast.replace(cars=cars)
 
 
 def _brake(
@@ -335,24 +354,27 @@ def _leader(vehicles: Agents, scene: Scene) -> tuple[jax.Array, jax.Array]:
 def _leave(slots: ScenarioSlots, cast: Cast, scene: Scene) -> tuple[ScenarioSlots, Cast]:
     """Takes away whom nobody sees once a scenario is over; without any, its slot is free."""
 
-    def without(part: Agents, num: int) -> Agents:
-        leaves = jnp.repeat(slots.is_leaving, num) & actors.is_hidden(part.xy, scene)
-        return actors.take_away(part, leaves)
+    def without(part: Agents, rows: Parts) -> Agents:
+        leaves = parts.of_slots(rows, slots.is_leaving, False)
+        return actors.take_away(part, leaves & actors.is_hidden(part.xy, scene))
 
-    cast = Cast(without(cast.cars, NUM_CARS), without(cast.others, NUM_OTHERS))
+    cast = Cast(without(cast.cars, slots.cars), without(cast.others, slots.others))
     num = len(slots.index)
-    here = cast.cars.valid.reshape(num, -1).any(axis=1)
-    here |= cast.others.valid.reshape(num, -1).any(axis=1)
+    here = parts.any_of(slots.cars, cast.cars.valid, num)
+    here |= parts.any_of(slots.others, cast.others.valid, num)
     empty = slots.is_leaving & ~here
     slots = slots.replace(
-        index=jnp.where(empty, -1, slots.index), is_leaving=slots.is_leaving & ~empty
+        index=jnp.where(empty, -1, slots.index),
+        is_leaving=slots.is_leaving & ~empty,
+        cars=parts.without(slots.cars, empty),
+        others=parts.without(slots.others, empty),
     )
     return slots, cast
 
 
-def _cues(slots: ScenarioSlots, num: int) -> Cues:
-    """What `num` actors of each slot go by."""
+def _cues(slots: ScenarioSlots, rows: Parts) -> Cues:
+    """What the actors in rows go by."""
     return Cues(
-        is_active=jnp.repeat(slots.is_armed | slots.is_playing, num),
-        triggered_s=jnp.repeat(slots.triggered_s, num),
+        is_active=parts.of_slots(rows, slots.is_armed | slots.is_playing, False),
+        triggered_s=parts.of_slots(rows, slots.triggered_s, -1.0),
     )

@@ -15,8 +15,14 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
+from carljax.sim.scenarios import parts
+from carljax.sim.scenarios.parts import Parts
+
 NUM_CARS = 4  # actors of a scenario that drive on lanes
 NUM_OTHERS = 3  # actors that stand or move straight on: pedestrians, bicycles, obstacles, doors
+# Rows of cars and of others that each further scenario in play at once adds to those of the first:
+# most scenarios have one car, or one or two others. source: ours
+MORE_CARS, MORE_OTHERS = 2, 1
 WAY_LANES = 5  # lanes of a car's way: a junction, both roads beside it and as much again
 NUM_PATCHES = 3  # stretches of disturbed control
 
@@ -27,7 +33,7 @@ DRIVE_MEET = 2  # likewise, but so as to be at `meet_lane_s` when the ego is at 
 
 
 class ScriptedCars(struct.PyTreeNode):
-    """Actors on lanes, L = NUM_CARS rows, W = WAY_LANES.
+    """Actors on lanes, L = NUM_CARS rows, W = WAY_LANES; those that there are come first.
 
     Attributes:
       model: (L,) int32, row in the table of vehicle classes; -1 for no car.
@@ -60,6 +66,8 @@ class ScriptedCars(struct.PyTreeNode):
 
 class ScriptedOthers(struct.PyTreeNode):
     """Actors off the lanes, F = NUM_OTHERS rows: they stand, then move straight on, then stand.
+
+    Those that there are come first.
 
     Attributes:
       kind: (F,) int32, KIND_*; KIND_NONE for nobody.
@@ -125,15 +133,17 @@ class Scenario(struct.PyTreeNode):
 
 
 class ScenarioSlots(struct.PyTreeNode):
-    """The scenarios in play, in H fixed slots; each slot owns rows of `Agents`.
+    """The scenarios in play, in H fixed slots, and their actors: P rows of cars, Q of others.
 
     Attributes:
       index: (H,) int32, row of the episode's scenarios; -1 for a free slot.
       is_leaving: (H,) bool, it is over, but some of its actors are still in sight.
       triggered_s: (H,) s since the trigger; negative while armed only.
-      has_appeared: (H, NUM_CARS) bool, this car has taken its place.
-      has_started: (H, NUM_OTHERS) bool, this actor moves or has moved.
-      moved: (H, NUM_OTHERS) m it has moved.
+      cars: (P,) whose the rows of cars are.
+      others: (Q,) whose the rows of others are.
+      has_appeared: (P,) bool, this car has taken its place.
+      has_started: (Q,) bool, this actor moves or has moved.
+      moved: (Q,) m it has moved.
       noise: (H, NUM_PATCHES, 2) in [-1, 1], disturbance of steering and throttle on each patch.
       braker: (H,) int32, row of the vehicle that brakes ahead of the ego; -1 before there is one.
       braked_s: (H,) s for which it has.
@@ -147,6 +157,8 @@ class ScenarioSlots(struct.PyTreeNode):
     index: jax.Array
     is_leaving: jax.Array
     triggered_s: jax.Array
+    cars: Parts
+    others: Parts
     has_appeared: jax.Array
     has_started: jax.Array
     moved: jax.Array
@@ -170,17 +182,30 @@ class ScenarioSlots(struct.PyTreeNode):
         return (self.index >= 0) & ~self.is_leaving & (self.triggered_s >= 0.0)
 
 
+def num_cars(num_slots: int) -> int:
+    """Returns P, the rows of cars for so many scenarios in play at once."""
+    return NUM_CARS + MORE_CARS * (num_slots - 1) if num_slots else 0
+
+
+def num_others(num_slots: int) -> int:
+    """Returns Q, the rows of others for so many scenarios in play at once."""
+    return NUM_OTHERS + MORE_OTHERS * (num_slots - 1) if num_slots else 0
+
+
 def empty_slots(num_slots: int) -> ScenarioSlots:
     """Slots before the first scenario."""
+    cars, others = num_cars(num_slots), num_others(num_slots)
     none = jnp.full((), -1, jnp.int32)
     false = jnp.zeros((), bool)
     return ScenarioSlots(
         index=jnp.full(num_slots, -1, jnp.int32),
         is_leaving=jnp.zeros(num_slots, bool),
         triggered_s=jnp.full(num_slots, -1.0, jnp.float32),
-        has_appeared=jnp.zeros((num_slots, NUM_CARS), bool),
-        has_started=jnp.zeros((num_slots, NUM_OTHERS), bool),
-        moved=jnp.zeros((num_slots, NUM_OTHERS), jnp.float32),
+        cars=parts.none(cars),
+        others=parts.none(others),
+        has_appeared=jnp.zeros(cars, bool),
+        has_started=jnp.zeros(others, bool),
+        moved=jnp.zeros(others, jnp.float32),
         noise=jnp.zeros((num_slots, NUM_PATCHES, 2), jnp.float32),
         braker=jnp.full(num_slots, -1, jnp.int32),
         braked_s=jnp.zeros(num_slots, jnp.float32),
