@@ -44,7 +44,9 @@ def environment(
       **env: further fields of `EnvConfig`.
     """
     values: EnvConfig = dataclasses.replace(config.env, num_agents=num_agents, **env)
-    bank = episodes.make_bank(towns, num_routes, values.population, 0, values.route_length)
+    bank = episodes.make_bank(
+        towns, num_routes, values.population, 0, values.route_length, values.scenario_spacing
+    )
     return make_env(bank, values, config.reward)
 
 
