@@ -44,8 +44,9 @@ def forecast_arc(
     # Chord of an arc: shorter than the arc by sin(h) / h, along the direction half way.
     chord = speed * times * jnp.sinc(half_turn / np.float32(np.pi))
     direction = yaw + slip + half_turn
-    offset = jnp.stack([chord * jnp.cos(direction), chord * jnp.sin(direction)], axis=-1)
-    return xy + offset, yaw + 2.0 * half_turn
+    # Not one offset (..., 2) of both: whatever is stacked a CPU computes number by number.
+    x, y = xy[..., 0] + chord * jnp.cos(direction), xy[..., 1] + chord * jnp.sin(direction)
+    return jnp.stack([x, y], axis=-1), yaw + 2.0 * half_turn
 
 
 def forecast_straight(

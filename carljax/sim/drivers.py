@@ -84,13 +84,16 @@ def accelerations(
     way_gap, way_speed = corridor.gaps(agents, seen, road_map)
     way_gap = jnp.where(agents.is_lawless, FAR, way_gap)
     driver = vehicles.driver(agents.model, params)
+    ahead = [(gap, leader_speed), (change_gap, change_speed), (way_gap, way_speed)]
 
     def respond(gap: jax.Array, leader_speed: jax.Array) -> jax.Array:
         return idm.acceleration(agents.speed, gap, leader_speed, free.speed, driver)
 
-    accel = jnp.minimum(respond(gap, leader_speed), respond(change_gap, change_speed))
-    accel = jnp.minimum(accel, respond(way_gap, way_speed))
-    accel = jnp.minimum(accel, respond(still, jnp.zeros_like(still)))
+    # All searches are over before anybody responds: the compiler would do both in one slow loop.
+    ahead, still = once((ahead, still))
+    accel = respond(still, jnp.zeros_like(still))
+    for gap, leader_speed in ahead:
+        accel = jnp.minimum(accel, respond(gap, leader_speed))
     accel = jnp.where(agents.is_braking_hard, -driver.brake_max, accel)
     return jnp.where(agents.valid, accel, 0.0)
 

@@ -76,7 +76,7 @@ def respawn(
     pose = pose_at(road_map, lane, place.s)
     speed, is_clear = _fit_in(lane, place.s, pose.xy, agents, others, road_map)
     can = is_clear & _is_hidden(pose.xy, ego) & (place.lane >= 0)
-    away = ((agents.xy - ego.xy) ** 2).sum(axis=1)
+    away = geometry.squared_distance(agents.xy, ego.xy)
     gone = _is_gone(agents, ego, away, road_map)
     chosen = jnp.argmax(jnp.where(gone, away + 1.0, 0.0))
     moves = (jnp.arange(gone.shape[0]) == chosen) & gone & can
@@ -120,7 +120,7 @@ def _fit_in(
     It can stop behind the car ahead and at its lane's end, and the car behind can stop for it.
     """
     cars = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), agents, others)
-    near = ((cars.xy - xy) ** 2).sum(axis=1) < SPAWN_GAP**2
+    near = geometry.squared_distance(cars.xy, xy) < SPAWN_GAP**2
     same = cars.valid & (cars.lanes[:, 0] == lane)
     ahead = jnp.where(same & (cars.lane_s > s), cars.lane_s - s, FAR).min()
     room = jnp.minimum(ahead, road_map.lane_length[lane] - s + STANDSTILL) - STANDSTILL

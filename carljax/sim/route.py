@@ -8,6 +8,8 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
+from carljax.sim import geometry
+
 # source: the authors' code draws lights from 20 points behind the ego to 150 ahead
 WINDOW_BACK = 24  # points kept behind the ego
 WINDOW_AHEAD = 152  # points kept ahead
@@ -127,13 +129,13 @@ def advance(route: Route, route_idx: jax.Array, xy: jax.Array) -> jax.Array:
 def distance(route: Route, route_idx: jax.Array, xy: jax.Array) -> jax.Array:
     """() m, to the nearest of the current and the next five points."""
     near = _near(route, route_idx)
-    return jnp.sqrt(((route.xy[near] - xy) ** 2).sum(axis=1).min())
+    return jnp.sqrt(geometry.squared_distance(route.xy[near], xy).min())
 
 
 def nearest(route: Route, route_idx: jax.Array, xy: jax.Array) -> jax.Array:
     """() int32, the nearest of the current and the next five points."""
     near = _near(route, route_idx)
-    return near[((route.xy[near] - xy) ** 2).sum(axis=1).argmin()]
+    return near[geometry.squared_distance(route.xy[near], xy).argmin()]
 
 
 def _near(route: Route, route_idx: jax.Array) -> jax.Array:

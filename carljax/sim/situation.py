@@ -129,7 +129,7 @@ def others(
     bits = layer_bits(road_map, stretch.town, agents.xy)
     ahead = stretch_idx + jnp.arange(OTHERS_AHEAD + 1)
     ahead = jnp.minimum(ahead, stretch.num_points - 1)
-    apart = ((agents.xy[:, None] - stretch.xy[ahead]) ** 2).sum(axis=-1)  # (N, points)
+    apart = geometry.squared_distance(agents.xy[:, None], stretch.xy[ahead])  # (N, points)
     nearest = ahead[jnp.argmin(apart, axis=1)]
     offset = geometry.to_frame(agents.xy, stretch.xy[nearest], stretch.yaw[nearest])
     begin = geometry.to_frame(ego.xy, stretch.xy[stretch_idx], stretch.yaw[stretch_idx])[0]

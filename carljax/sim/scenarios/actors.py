@@ -87,10 +87,10 @@ def may_appear(
     Returns:
       (n,) bool.
     """
-    apart = ((agents.xy[None] - xy[:, None]) ** 2).sum(axis=-1)
+    apart = geometry.squared_distance(agents.xy[None], xy[:, None])
     needed = 0.5 * (agents.length[None] + length[:, None]) + gap
     clear = (~agents.valid[None] | (apart > needed**2)).all(axis=1)
-    from_ego = ((scene.ego.xy - xy) ** 2).sum(axis=-1)
+    from_ego = geometry.squared_distance(scene.ego.xy, xy)
     clear &= from_ego > (0.5 * (length + scene.ego_length) + gap) ** 2
     return clear & (scene.is_start | is_hidden(xy, scene))
 
@@ -149,7 +149,7 @@ def one_at_a_time(xy: jax.Array, starts: jax.Array) -> jax.Array:
       xy: (n, 2) m, where they start.
       starts: (n,) bool.
     """
-    near = ((xy[:, None] - xy[None]) ** 2).sum(axis=-1) < CAR_GAP**2
+    near = geometry.squared_distance(xy[:, None], xy) < CAR_GAP**2
     earlier = jnp.tri(len(starts), k=-1, dtype=bool)  # [i, j]: j comes before i
     return starts & ~(near & earlier & starts[None]).any(axis=1)
 
