@@ -117,6 +117,14 @@ def test_held_junctions_lie_ahead_on_the_route(drawn):
     assert num > 50
 
 
+def test_actors_that_there_are_come_first(drawn):
+    """The engine gives rows to so many of them, counted from the first."""
+    for _, _, _, found in drawn:
+        for scenario in found:
+            for there in (scenario.cars.model >= 0, scenario.others.kind != KIND_NONE):
+                assert not (there[1:] & ~there[:-1]).any()
+
+
 def test_cars_begin_on_a_way_of_lanes_that_follow_one_another(drawn):
     for town, first, _, found in drawn:
         for scenario in found:
