@@ -150,3 +150,10 @@ def test_overlap_is_symmetric_and_survives_moving_the_world():
         moved[i + 1] = f32[i + 1] + 0.9
     np.testing.assert_array_equal(forth, back)
     np.testing.assert_array_equal(forth, geometry.boxes_overlap(*moved))
+
+
+def test_squared_distances_are_those_of_numpy():
+    rng = np.random.default_rng(5)
+    a, b = rng.normal(size=(4, 1, 2)) * 100, rng.normal(size=(7, 2)) * 100
+    found = geometry.squared_distance(jnp.float32(a), jnp.float32(b))
+    np.testing.assert_allclose(found, np.linalg.norm(a - b, axis=-1) ** 2, rtol=1e-4, atol=1e-2)

@@ -269,6 +269,22 @@ def test_scenarios_share_the_rows_of_cars(road_map):
     assert world.kinds(CAR, 6) == [KIND_NONE] * 6  # those of the second come at its trigger
 
 
+def test_scenarios_share_the_rows_of_others(road_map):
+    def others(*places):
+        columns = [walker(x) for x in places]
+        return {name: [column[name][0] for column in columns] for name in columns[0]}
+
+    first = PLAIN | {"others": others(110.0, 120.0, 130.0)}
+    small = PLAIN | {"others": others(150.0)}
+    large = PLAIN | {"others": others(150.0, 160.0)}
+    world = World(road_map, first, small).at(25.0, steps=2)
+    assert world.slots.others.slot.tolist() == [0, 0, 0, 1]
+    assert [world.x(OTHER + k) for k in range(4)] == [110.0, 120.0, 130.0, 150.0]
+    world = World(road_map, first, large).at(25.0, steps=2)
+    assert world.slots.index.tolist() == [0, -1] and world.slots.next_index == 1  # 1 row for 2
+    assert world.kinds(OTHER, 4) == [KIND_PEDESTRIAN] * 3 + [KIND_NONE]
+
+
 def test_a_full_house_waits_and_then_takes_over_who_is_leaving(road_map):
     plain = {"arm_s": 20.0, "end_s": 70.0, "timeout_s": 30.0}
     world = World(
