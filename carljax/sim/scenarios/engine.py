@@ -2,9 +2,9 @@
 
 When the ego comes to a scenario's `arm_s` its actors take their places, if there are rows for them
 (`parts`), nobody sees them appear and nobody is in their place; else the scenario waits, and is
-left out once its trigger is passed.
-From the trigger on it plays, until the ego is past its end or its time is up. Then its actors leave
-as soon as nobody sees them, and the slot is free.
+left out once its trigger is passed. From the trigger on it plays, until the ego is past its end or
+its time is up. Then its actors leave as soon as nobody sees them, and the slot and its rows are
+free.
 """
 
 from __future__ import annotations
@@ -229,9 +229,9 @@ def _in_play(slots: ScenarioSlots, scenarios: Scenario, episode_idx: jax.Array) 
     """
     script = scripts(scenarios, episode_idx, slots.index)
 
-    def of_rows(actors: Any, rows: Parts) -> Any:
+    def of_rows(scripted: Any, rows: Parts) -> Any:
         index = jnp.maximum(slots.index, 0)[jnp.maximum(rows.slot, 0)]
-        return jax.tree.map(lambda x: x[episode_idx, index, rows.number], actors)
+        return jax.tree.map(lambda x: x[episode_idx, index, rows.number], scripted)
 
     cars, others = of_rows(scenarios.cars, slots.cars), of_rows(scenarios.others, slots.others)
     return script.replace(
