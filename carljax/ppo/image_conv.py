@@ -17,6 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from carljax.ppo import pieces
 from carljax.ppo.conv import plain_conv
 
 
@@ -86,29 +87,38 @@ def _weight_gradient(x: jax.Array, w: jax.Array, g: jax.Array, stride: int) -> j
     """One product of matrices for each row of the kernel: the cotangent by the image's blocks.
 
     A block is the first of its own outputs' two and the second of the ones before: so each meets
-    the cotangents of both.
+    the cotangents of both. What makes the cotangent is done before the loop over pieces begins;
+    without one the compiler would do it anew wherever the cotangent is looked at.
     """
-    kernel, num_out = w.shape[0], w.shape[-1]
+    kernel = w.shape[0]
+    width = _outputs_at_once(kernel, stride) * stride * w.shape[2]
+
+    def products(x: jax.Array, g: jax.Array) -> jax.Array:
+        both = _own_and_before(g, kernel, stride)
+        blocks = _blocks(x, kernel, stride)
+        last = stride * (g.shape[1] - 1) + 1
+        rows = [blocks[:, i : i + last : stride] for i in range(kernel)]
+        rows = [row.reshape(-1, width).astype(w.dtype) for row in rows]
+        # The barriers keep XLA from folding the conversions back into the products.
+        return jnp.stack([both @ jax.lax.optimization_barrier(row) for row in rows])
+
+    num_blocks = -(-g.shape[2] // _outputs_at_once(kernel, stride)) + 1
+    row_bytes = g.shape[1] * num_blocks * width * w.dtype.itemsize
+    size = pieces.size_of(x.shape[0], row_bytes)
+    banded = pieces.sum_over(products, size, x, g)
+    banded = banded.reshape(kernel, 2, -1, width).transpose(0, 1, 3, 2)
+    return jax.linear_transpose(functools.partial(_banded, stride=stride), w)(banded)[0]
+
+
+def _own_and_before(g: jax.Array, kernel: int, stride: int) -> jax.Array:
+    """(2 * outputs * O, blocks): each block's cotangents of its own outputs and of those before."""
+    num, rows, columns, num_out = g.shape
     side = _outputs_at_once(kernel, stride)
-    num, rows, columns, _ = g.shape
     g = jnp.pad(g, ((0, 0), (0, 0), (0, -columns % side), (0, 0)))
     g = g.reshape(num, rows, -1, side * num_out)
     own, before = (jnp.pad(g, ((0, 0), (0, 0), room, (0, 0))) for room in ((0, 1), (1, 0)))
     both = jnp.concatenate([own, before], axis=-1)
-    # The barriers keep XLA from folding transpose and conversion back into the products.
-    both = jax.lax.optimization_barrier(both.reshape(-1, both.shape[-1]).T)
-    blocks = _blocks(x, kernel, stride)
-    last = stride * (rows - 1) + 1
-
-    def product(i: jax.Array) -> jax.Array:
-        row = jax.lax.dynamic_slice_in_dim(blocks, i, last, axis=1)[:, ::stride]
-        row = row.reshape(-1, blocks.shape[-1]).astype(w.dtype)
-        return both @ jax.lax.optimization_barrier(row)
-
-    # A loop, so that there is memory for one row of floats at a time.
-    products = jax.lax.map(product, jnp.arange(kernel))
-    banded = products.reshape(kernel, 2, side * num_out, -1).transpose(0, 1, 3, 2)
-    return jax.linear_transpose(functools.partial(_banded, stride=stride), w)(banded)[0]
+    return jax.lax.optimization_barrier(both.reshape(-1, both.shape[-1]).T)
 
 
 def _outputs_at_once(kernel: int, stride: int) -> int:

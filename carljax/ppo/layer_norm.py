@@ -35,6 +35,16 @@ class LayerNorm(nn.Module):
         return layer_norm(x, scale, bias, self.epsilon).astype(self.dtype)
 
 
+class Affine(nn.Module):
+    """The parameters of a LayerNorm, for a layer that applies it itself."""
+
+    @nn.compact
+    def __call__(self, shape: tuple[int, ...]) -> tuple[jax.Array, jax.Array]:
+        """Returns scale and bias of a shape, float32."""
+        scale = self.param("scale", nn.initializers.ones, shape)
+        return scale, self.param("bias", nn.initializers.zeros, shape)
+
+
 @functools.partial(jax.custom_vjp, nondiff_argnums=(3,))
 def layer_norm(x: jax.Array, scale: jax.Array, bias: jax.Array, eps: float) -> jax.Array:
     """Normalises each image.

@@ -18,10 +18,10 @@ import jax.numpy as jnp
 import numpy as np
 from flax import linen as nn
 
+from carljax.ppo import image_layer
 from carljax.ppo.config import NetworkConfig
 from carljax.ppo.conv import conv, matmul, patch_conv
-from carljax.ppo.image_conv import image_conv
-from carljax.ppo.layer_norm import LayerNorm
+from carljax.ppo.layer_norm import Affine, LayerNorm
 from carljax.sim.types import Observation
 
 # Channels, kernel, stride of each convolution. source: CaRL paper, "Architecture" (and Roach's).
@@ -140,15 +140,28 @@ class ConvEncoder(nn.Module):
             weight, bias = _conv_params(self, i, (kernel, kernel, x.shape[-1], features))
             padding, stride = conv_fit(x.shape[1:3], kernel, stride)
             x = jnp.pad(x, ((0, 0), *padding, (0, 0)))
-            if i == 0:  # uint8 goes in as it is and the 1 / 255 onto the weights
-                x = image_conv(x, (weight * _BYTE).astype(dtype), stride)
-            else:
-                x = conv(x, weight.astype(dtype), stride)
+            name = f"LayerNorm_{i}"
+            if i == 0:
+                x = self._image_layer(x, weight, bias, stride, name)
+                continue
+            x = conv(x, weight.astype(dtype), stride)
             x += bias.astype(dtype)
             if self.config.layer_norm:
-                x = LayerNorm(NORM_EPS, dtype)(x)
+                x = LayerNorm(NORM_EPS, dtype, name=name)(x)
             x = nn.relu(x)
         return x.reshape(x.shape[0], -1)
+
+    def _image_layer(
+        self, x: jax.Array, weight: jax.Array, bias: jax.Array, stride: int, norm_name: str
+    ) -> jax.Array:
+        """The first layer: uint8 goes in as it is and the 1 / 255 onto the weights."""
+        dtype, norm = self.config.compute_dtype, None
+        if self.config.layer_norm:
+            out = [(size - weight.shape[0]) // stride + 1 for size in x.shape[1:3]]
+            norm = Affine(name=norm_name)((*out, weight.shape[-1]))
+        weight = weight * _BYTE
+        params = image_layer.Params(weight.astype(dtype), bias.astype(dtype), norm)
+        return image_layer.image_layer(x, params, stride, NORM_EPS)
 
 
 def conv_fit(size: tuple[int, ...], kernel: int, stride: int) -> tuple[list[tuple[int, int]], int]:

@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 import optax
 
-from carljax.ppo import hints, kl_patience
+from carljax.ppo import hints, kl_patience, pieces
 from carljax.ppo.config import PPOConfig
 from carljax.ppo.loss import loss
 from carljax.ppo.networks import ActorCritic
@@ -174,20 +174,8 @@ def minibatch_gradient(
     if config.micro_batch_size is None:
         total = piece(rows, weight, advantage)
     else:
-        pieces = [x.reshape(-1, config.micro_batch_size) for x in (rows, weight, advantage)]
-        total = _sum_over(piece, pieces)
+        total = pieces.sum_over(piece, config.micro_batch_size, rows, weight, advantage)
     return jax.lax.psum(total, AXIS)
-
-
-def _sum_over(function: Any, pieces: list[jax.Array]) -> Any:
-    """Adds up function(*piece) over the leading axis."""
-
-    def add(total: Any, piece: list[jax.Array]) -> tuple[Any, None]:
-        return jax.tree.map(jnp.add, total, function(*piece)), None
-
-    like = jax.eval_shape(function, *[x[0] for x in pieces])
-    zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), like)
-    return jax.lax.scan(add, zeros, pieces)[0]
 
 
 def sum_over_devices(x: jax.Array) -> jax.Array:
