@@ -20,7 +20,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from carljax.ppo import bands
+
 _NHWC = ("NHWC", "HWIO", "NHWC")
+_FEW_CHANNELS = 8  # of the input: twice as fast by products; no faster with 16
 
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(2,))
@@ -70,7 +73,12 @@ conv.defvjp(_conv_fwd, _conv_bwd)
 
 
 def _weight_gradient(x: jax.Array, w: jax.Array, g: jax.Array, stride: int) -> jax.Array:
-    """Weight gradient as a convolution over the batch axis, in the one layout that Eigen takes."""
+    """Weight gradient as a convolution over the batch axis, in the one layout that Eigen takes.
+
+    With few channels products of matrices are faster.
+    """
+    if w.shape[2] <= _FEW_CHANNELS:
+        return bands.weight_gradient(x, w, g, stride)
     dw = jax.lax.conv_general_dilated(
         x.transpose(3, 1, 2, 0),  # (I, H, W, N): the batch is what is summed over
         g.transpose(1, 2, 0, 3),  # (H', W', N, O)

@@ -1,24 +1,26 @@
 """The first convolution, over an image of bytes: few channels in, few out.
 
-It takes most of the time of the paper's networks on a CPU, since a product of matrices with eight
-columns is slow. So a CPU gets one with more of them: the image is read in blocks of columns, and
-from two neighbouring blocks some neighbouring outputs are made at once, by a kernel that holds the
-weights once for each. At 5 x 5, stride 2, three eighths are zeros, multiplied in vain, and still
-value and weight gradient together take half to three fifths of the time (10 channels, 64 to 128
-px, two cores), the value alone 0.8 to 0.93 of it. GPUs and TPUs get the plain convolution.
+It takes most of the time of the paper's networks on a CPU, where a convolution or its gradient
+copies each pixel, as a float, once for each place in the kernel that it meets. So a CPU gets a
+product of matrices (see `bands`): a row for each block of pixels, `stride` rows high, a column for
+each output that sees it. The products of neighbouring blocks are then added up. Each pixel is
+copied once.
+GPUs and TPUs get the plain convolution.
 """
 
 from __future__ import annotations
 
 import functools
-import math
+import itertools
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from carljax.ppo import pieces
+from carljax.ppo import bands, pieces
 from carljax.ppo.conv import plain_conv
+
+_VECTOR = 8  # floats
 
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(2,))
@@ -36,7 +38,7 @@ def image_conv(x: jax.Array, w: jax.Array, stride: int) -> jax.Array:
     return jax.lax.platform_dependent(
         x,
         w,
-        cpu=functools.partial(_wide, stride=stride),
+        cpu=functools.partial(_by_blocks, stride=stride),
         default=functools.partial(_plain, stride=stride),
     )
 
@@ -67,87 +69,115 @@ def _plain(x: jax.Array, w: jax.Array, stride: int) -> jax.Array:
     return plain_conv(x.astype(w.dtype), w, stride)
 
 
-def _wide(x: jax.Array, w: jax.Array, stride: int) -> jax.Array:
-    """A convolution whose pixels are blocks of columns and whose channels are outputs side by side.
-
-    The blocks and the outputs are reshapes, so nothing is copied but the image to floats.
-    """
+def _by_blocks(x: jax.Array, w: jax.Array, stride: int) -> jax.Array:
     columns = _num_outputs(x.shape[2], w.shape[0], stride)
-    out = jax.lax.conv_general_dilated(
-        _blocks(x, w.shape[0], stride).astype(w.dtype),
-        _banded(w, stride),
-        (stride, 1),
-        "VALID",
-        dimension_numbers=("NHWC", "HWIO", "NHWC"),
-    )
-    return out.reshape(*out.shape[:2], -1, w.shape[-1])[:, :, :columns]
+    blocks, kernel = _blocks(x, w.shape[0], stride), _block_kernel(w, stride)
+    seen = _rows_seen(w.shape[0], stride)
+
+    def outputs(blocks: jax.Array) -> jax.Array:
+        matrices = _matrices(blocks, stride, w.dtype)
+        parts = [
+            jnp.matmul(matrix, rows, preferred_element_type=jnp.float32)
+            for matrix, rows in zip(matrices, jnp.split(kernel, len(matrices)), strict=True)
+        ]
+        shape = (blocks.shape[0], -1, blocks.shape[2], seen, 2, kernel.shape[1] // (2 * seen))
+        out = _add_up([part.reshape(shape) for part in parts])
+        return out.reshape(*out.shape[:2], -1, w.shape[-1])[:, :, :columns].astype(w.dtype)
+
+    return pieces.map_over(outputs, _images_at_once(blocks, kernel.shape[1], stride), blocks)
+
+
+def _add_up(parts: list[jax.Array]) -> jax.Array:
+    """(N, rows, columns, outputs * O) from what each block gives to those who see it.
+
+    Args:
+      parts: (N, rows of blocks, columns of blocks, R, 2, outputs * O), to be added up too.
+    """
+    _, height, width, seen = parts[0].shape[:4]
+    rows, columns = height - seen + 1, width - 1
+    shifts = itertools.product(parts, range(seen), range(2))
+    seen_parts = [part[:, i : i + rows, j : j + columns, i, j] for part, i, j in shifts]
+    return functools.reduce(jnp.add, seen_parts)
 
 
 def _weight_gradient(x: jax.Array, w: jax.Array, g: jax.Array, stride: int) -> jax.Array:
-    """One product of matrices for each row of the kernel: the cotangent by the image's blocks.
+    """The product of each block's pixels and the cotangents of the outputs that see it."""
+    blocks = _blocks(x, w.shape[0], stride)
+    block_kernel = functools.partial(_block_kernel, stride=stride)
+    outputs = jax.eval_shape(block_kernel, w).shape[1]
 
-    A block is the first of its own outputs' two and the second of the ones before: so each meets
-    the cotangents of both. What makes the cotangent is done before the loop over pieces begins;
-    without one the compiler would do it anew wherever the cotangent is looked at.
+    def product(blocks: jax.Array, g: jax.Array) -> jax.Array:
+        # Tall matrices are multiplied several times faster with the first one transposed.
+        seeing = _seeing(g, blocks, w.shape[0], stride)
+        matrices = _matrices(blocks, stride, w.dtype)
+        return jnp.concatenate([seeing @ matrix for matrix in matrices], axis=1)
+
+    products = pieces.sum_over(product, _images_at_once(blocks, outputs, stride), blocks, g)
+    return jax.linear_transpose(block_kernel, w)(products.T)[0]
+
+
+def _seeing(g: jax.Array, blocks: jax.Array, kernel: int, stride: int) -> jax.Array:
+    """(outputs that see a block * O, blocks) cotangents.
+
+    As one long row of blocks: an output so many blocks further is so many numbers further.
     """
-    kernel = w.shape[0]
-    width = _outputs_at_once(kernel, stride) * stride * w.shape[2]
-
-    def products(x: jax.Array, g: jax.Array) -> jax.Array:
-        both = _own_and_before(g, kernel, stride)
-        blocks = _blocks(x, kernel, stride)
-        last = stride * (g.shape[1] - 1) + 1
-        rows = [blocks[:, i : i + last : stride] for i in range(kernel)]
-        rows = [row.reshape(-1, width).astype(w.dtype) for row in rows]
-        # The barriers keep XLA from folding the conversions back into the products.
-        return jnp.stack([both @ jax.lax.optimization_barrier(row) for row in rows])
-
-    num_blocks = -(-g.shape[2] // _outputs_at_once(kernel, stride)) + 1
-    row_bytes = g.shape[1] * num_blocks * width * w.dtype.itemsize
-    size = pieces.size_of(x.shape[0], row_bytes)
-    banded = pieces.sum_over(products, size, x, g)
-    banded = banded.reshape(kernel, 2, -1, width).transpose(0, 1, 3, 2)
-    return jax.linear_transpose(functools.partial(_banded, stride=stride), w)(banded)[0]
-
-
-def _own_and_before(g: jax.Array, kernel: int, stride: int) -> jax.Array:
-    """(2 * outputs * O, blocks): each block's cotangents of its own outputs and of those before."""
     num, rows, columns, num_out = g.shape
-    side = _outputs_at_once(kernel, stride)
-    g = jnp.pad(g, ((0, 0), (0, 0), (0, -columns % side), (0, 0)))
-    g = g.reshape(num, rows, -1, side * num_out)
-    own, before = (jnp.pad(g, ((0, 0), (0, 0), room, (0, 0))) for room in ((0, 1), (1, 0)))
-    both = jnp.concatenate([own, before], axis=-1)
-    return jax.lax.optimization_barrier(both.reshape(-1, both.shape[-1]).T)
+    side, seen = bands.outputs_at_once(kernel, stride), _rows_seen(kernel, stride)
+    width = blocks.shape[2]
+    g = jnp.pad(g, ((0, 0), (0, seen - 1), (0, width * side - columns), (0, 0)))
+    g = g.reshape(-1, side * num_out)
+    ahead = [i * width + j for i, j in itertools.product(range(seen), range(2))]
+    row = jax.lax.optimization_barrier(jnp.pad(g.T, ((0, 0), (ahead[-1], 0))))
+    shifted = [row[:, ahead[-1] - n :][:, : g.shape[0]] for n in ahead]
+    return jax.lax.optimization_barrier(jnp.concatenate(shifted))
 
 
-def _outputs_at_once(kernel: int, stride: int) -> int:
-    """Outputs side by side that see no more than two blocks of so many strides; two at least."""
-    return max(2, math.ceil(kernel / stride) - 1)
+def _blocks(x: jax.Array, kernel: int, stride: int) -> jax.Array:
+    """(N, stride * rows, columns, pixels * I): the image in blocks, `stride` rows high."""
+    height = stride * (_num_outputs(x.shape[1], kernel, stride) + _rows_seen(kernel, stride) - 1)
+    x = jnp.pad(x, ((0, 0), (0, max(height - x.shape[1], 0)), (0, 0), (0, 0)))
+    return bands.blocks(x[:, :height], kernel, stride)
+
+
+def _matrices(blocks: jax.Array, stride: int, dtype: jnp.dtype) -> list[jax.Array]:
+    """(blocks, pixels of a block * I): one of them, or one for each row of a block.
+
+    Rows that are no whole vectors take six times as long to copy side by side.
+    """
+    num, height, columns, width = blocks.shape
+    blocks = blocks.reshape(num, height // stride, stride, columns, width)
+    if width % _VECTOR == 0:
+        rows = [blocks.transpose(0, 1, 3, 2, 4)]
+    else:
+        rows = [blocks[:, :, i] for i in range(stride)]
+    # The barrier keeps XLA from folding the conversion into the product, which would be slower.
+    size = num * height // stride * columns
+    return [jax.lax.optimization_barrier(x.astype(dtype).reshape(size, -1)) for x in rows]
+
+
+def _block_kernel(w: jax.Array, stride: int) -> jax.Array:
+    """(pixels of a block * I, outputs that see it * O): the weights by which they do, or zero."""
+    seen = _rows_seen(w.shape[0], stride)
+    w = bands.banded(w, stride)
+    w = jnp.pad(w, ((0, seen * stride - w.shape[0]), (0, 0), (0, 0), (0, 0)))
+    w = w.reshape(seen, stride, *w.shape[1:]).transpose(1, 3, 0, 2, 4)
+    return w.reshape(w.shape[0] * w.shape[1], -1)
+
+
+def _images_at_once(blocks: jax.Array, outputs: int, stride: int) -> int:
+    """So many that their products fit the cache.
+
+    A loop over them ends what the compiler fuses: else it would add the products up anew wherever
+    the outputs are looked at, and make a cotangent anew for each of its copies.
+    """
+    height, width = blocks.shape[1:3]
+    return pieces.size_of(blocks.shape[0], 4 * height // stride * width * outputs)
+
+
+def _rows_seen(kernel: int, stride: int) -> int:
+    """Of blocks, by an output."""
+    return -(-kernel // stride)
 
 
 def _num_outputs(size: int, kernel: int, stride: int) -> int:
     return (size - kernel) // stride + 1
-
-
-def _blocks(x: jax.Array, kernel: int, stride: int) -> jax.Array:
-    """(N, H, B, block * I): the image's columns in blocks, one more than blocks of outputs."""
-    num, height, width, channels = x.shape
-    side = _outputs_at_once(kernel, stride)
-    count = -(-_num_outputs(width, kernel, stride) // side) + 1
-    needed = count * side * stride
-    x = jnp.pad(x, ((0, 0), (0, 0), (0, max(needed - width, 0)), (0, 0)))[:, :, :needed]
-    return x.reshape(num, height, count, side * stride * channels)
-
-
-def _banded(w: jax.Array, stride: int) -> jax.Array:
-    """(K, 2, block * I, outputs * O): the weights once for each output, where it sees them."""
-    kernel, _, num_in, num_out = w.shape
-    side = _outputs_at_once(kernel, stride)
-    columns = 2 * side * stride
-    shifted = [
-        jnp.pad(w, ((0, 0), (p * stride, columns - kernel - p * stride), (0, 0), (0, 0)))
-        for p in range(side)
-    ]
-    banded = jnp.stack(shifted, axis=3)
-    return banded.reshape(kernel, 2, side * stride * num_in, side * num_out)

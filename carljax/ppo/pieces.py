@@ -38,7 +38,7 @@ def map_over(function: Callable[..., Any], size: int, *batch: jax.Array) -> Any:
     Returns:
       What function(*batch) does, made of pieces.
     """
-    made = jax.lax.map(lambda piece: function(*piece), _cut(size, batch))
+    made = jax.lax.map(lambda i: function(*_piece(i, size, batch)), _indices(size, batch))
     return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), made)
 
 
@@ -53,15 +53,19 @@ def sum_over(function: Callable[..., Any], size: int, *batch: jax.Array) -> Any:
     Returns:
       The sum of function(*piece).
     """
-    pieces = _cut(size, batch)
 
-    def add(total: Any, piece: list[jax.Array]) -> tuple[Any, None]:
-        return jax.tree.map(jnp.add, total, function(*piece)), None
+    def add(total: Any, i: jax.Array) -> tuple[Any, None]:
+        return jax.tree.map(jnp.add, total, function(*_piece(i, size, batch))), None
 
-    like = jax.eval_shape(function, *[x[0] for x in pieces])
+    like = jax.eval_shape(lambda: function(*_piece(0, size, batch)))
     zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), like)
-    return jax.lax.scan(add, zeros, pieces)[0]
+    return jax.lax.scan(add, zeros, _indices(size, batch))[0]
 
 
-def _cut(size: int, batch: tuple[jax.Array, ...]) -> list[jax.Array]:
-    return [x.reshape(-1, size, *x.shape[1:]) for x in batch]
+def _indices(size: int, batch: tuple[jax.Array, ...]) -> jax.Array:
+    return jnp.arange(batch[0].shape[0] // size)
+
+
+def _piece(i: int | jax.Array, size: int, batch: tuple[jax.Array, ...]) -> list[jax.Array]:
+    # A slice, since XLA:CPU copies an array of (N, 1, ...) pieces before its loop.
+    return [jax.lax.dynamic_slice_in_dim(x, i * size, size) for x in batch]
