@@ -70,21 +70,22 @@ def _plain(x: jax.Array, w: jax.Array, stride: int) -> jax.Array:
 
 
 def _by_blocks(x: jax.Array, w: jax.Array, stride: int) -> jax.Array:
-    columns = _num_outputs(x.shape[2], w.shape[0], stride)
-    blocks, kernel = _blocks(x, w.shape[0], stride), _block_kernel(w, stride)
-    seen = _rows_seen(w.shape[0], stride)
+    kernel_size, num_out = w.shape[0], w.shape[-1]
+    columns, seen = _num_outputs(x.shape[2], kernel_size, stride), _rows_seen(kernel_size, stride)
+    kernel = _block_kernel(w, stride)
 
-    def outputs(blocks: jax.Array) -> jax.Array:
-        matrices = _matrices(blocks, stride, w.dtype)
+    def outputs(x: jax.Array) -> jax.Array:
+        blocks = _blocks(x, kernel_size, stride)
+        matrices = _matrices(blocks, w.dtype)
         parts = [
             jnp.matmul(matrix, rows, preferred_element_type=jnp.float32)
             for matrix, rows in zip(matrices, jnp.split(kernel, len(matrices)), strict=True)
         ]
-        shape = (blocks.shape[0], -1, blocks.shape[2], seen, 2, kernel.shape[1] // (2 * seen))
+        shape = (*blocks.shape[:2], blocks.shape[3], seen, 2, kernel.shape[1] // (2 * seen))
         out = _add_up([part.reshape(shape) for part in parts])
-        return out.reshape(*out.shape[:2], -1, w.shape[-1])[:, :, :columns].astype(w.dtype)
+        return out.reshape(*out.shape[:2], -1, num_out)[:, :, :columns].astype(w.dtype)
 
-    return pieces.map_over(outputs, _images_at_once(blocks, kernel.shape[1], stride), blocks)
+    return pieces.map_over(outputs, _images_at_once(x, w, stride), x)
 
 
 def _add_up(parts: list[jax.Array]) -> jax.Array:
@@ -102,17 +103,15 @@ def _add_up(parts: list[jax.Array]) -> jax.Array:
 
 def _weight_gradient(x: jax.Array, w: jax.Array, g: jax.Array, stride: int) -> jax.Array:
     """The product of each block's pixels and the cotangents of the outputs that see it."""
-    blocks = _blocks(x, w.shape[0], stride)
-    block_kernel = functools.partial(_block_kernel, stride=stride)
-    outputs = jax.eval_shape(block_kernel, w).shape[1]
 
-    def product(blocks: jax.Array, g: jax.Array) -> jax.Array:
+    def product(x: jax.Array, g: jax.Array) -> jax.Array:
+        blocks = _blocks(x, w.shape[0], stride)
         # Tall matrices are multiplied several times faster with the first one transposed.
         seeing = _seeing(g, blocks, w.shape[0], stride)
-        matrices = _matrices(blocks, stride, w.dtype)
-        return jnp.concatenate([seeing @ matrix for matrix in matrices], axis=1)
+        return jnp.concatenate([seeing @ m for m in _matrices(blocks, w.dtype)], axis=1)
 
-    products = pieces.sum_over(product, _images_at_once(blocks, outputs, stride), blocks, g)
+    products = pieces.sum_over(product, _images_at_once(x, w, stride), x, g)
+    block_kernel = functools.partial(_block_kernel, stride=stride)
     return jax.linear_transpose(block_kernel, w)(products.T)[0]
 
 
@@ -123,7 +122,7 @@ def _seeing(g: jax.Array, blocks: jax.Array, kernel: int, stride: int) -> jax.Ar
     """
     num, rows, columns, num_out = g.shape
     side, seen = bands.outputs_at_once(kernel, stride), _rows_seen(kernel, stride)
-    width = blocks.shape[2]
+    width = blocks.shape[3]
     g = jnp.pad(g, ((0, 0), (0, seen - 1), (0, width * side - columns), (0, 0)))
     g = g.reshape(-1, side * num_out)
     ahead = [i * width + j for i, j in itertools.product(range(seen), range(2))]
@@ -133,26 +132,26 @@ def _seeing(g: jax.Array, blocks: jax.Array, kernel: int, stride: int) -> jax.Ar
 
 
 def _blocks(x: jax.Array, kernel: int, stride: int) -> jax.Array:
-    """(N, stride * rows, columns, pixels * I): the image in blocks, `stride` rows high."""
-    height = stride * (_num_outputs(x.shape[1], kernel, stride) + _rows_seen(kernel, stride) - 1)
-    x = jnp.pad(x, ((0, 0), (0, max(height - x.shape[1], 0)), (0, 0), (0, 0)))
-    return bands.blocks(x[:, :height], kernel, stride)
+    """(N, rows, stride, columns, pixels * I): the image in blocks, `stride` rows high."""
+    rows = _num_outputs(x.shape[1], kernel, stride) + _rows_seen(kernel, stride) - 1
+    x = jnp.pad(x, ((0, 0), (0, max(rows * stride - x.shape[1], 0)), (0, 0), (0, 0)))
+    x = bands.blocks(x[:, : rows * stride], kernel, stride)
+    return x.reshape(x.shape[0], rows, stride, *x.shape[2:])
 
 
-def _matrices(blocks: jax.Array, stride: int, dtype: jnp.dtype) -> list[jax.Array]:
+def _matrices(blocks: jax.Array, dtype: jnp.dtype) -> list[jax.Array]:
     """(blocks, pixels of a block * I): one of them, or one for each row of a block.
 
     Rows that are no whole vectors take six times as long to copy side by side.
     """
-    num, height, columns, width = blocks.shape
-    blocks = blocks.reshape(num, height // stride, stride, columns, width)
+    num, rows, stride, columns, width = blocks.shape
     if width % _VECTOR == 0:
-        rows = [blocks.transpose(0, 1, 3, 2, 4)]
+        parts = [blocks.transpose(0, 1, 3, 2, 4)]
     else:
-        rows = [blocks[:, :, i] for i in range(stride)]
+        parts = [blocks[:, :, i] for i in range(stride)]
+    parts = [x.astype(dtype).reshape(num * rows * columns, -1) for x in parts]
     # The barrier keeps XLA from folding the conversion into the product, which would be slower.
-    size = num * height // stride * columns
-    return [jax.lax.optimization_barrier(x.astype(dtype).reshape(size, -1)) for x in rows]
+    return [jax.lax.optimization_barrier(x) for x in parts]
 
 
 def _block_kernel(w: jax.Array, stride: int) -> jax.Array:
@@ -164,14 +163,15 @@ def _block_kernel(w: jax.Array, stride: int) -> jax.Array:
     return w.reshape(w.shape[0] * w.shape[1], -1)
 
 
-def _images_at_once(blocks: jax.Array, outputs: int, stride: int) -> int:
+def _images_at_once(x: jax.Array, w: jax.Array, stride: int) -> int:
     """So many that their products fit the cache.
 
     A loop over them ends what the compiler fuses: else it would add the products up anew wherever
     the outputs are looked at, and make a cotangent anew for each of its copies.
     """
-    height, width = blocks.shape[1:3]
-    return pieces.size_of(blocks.shape[0], 4 * height // stride * width * outputs)
+    kernel = jax.eval_shape(functools.partial(_block_kernel, stride=stride), w)
+    pixels = x[0, :, :, 0].size * w.shape[2]
+    return pieces.size_of(x.shape[0], 4 * kernel.shape[1] * pixels // kernel.shape[0])
 
 
 def _rows_seen(kernel: int, stride: int) -> int:
