@@ -8,6 +8,7 @@ many images at a time as leave such an array in the cache. GPUs and TPUs take al
 from __future__ import annotations
 
 import functools
+import math
 from typing import NamedTuple
 
 import jax
@@ -51,15 +52,15 @@ def image_layer(x: jax.Array, params: Params, stride: int, eps: float) -> jax.Ar
 def _image_layer_fwd(
     x: jax.Array, params: Params, stride: int, eps: float
 ) -> tuple[jax.Array, tuple[jax.Array, Params, jax.Array]]:
-    def layer(x: jax.Array, params: Params) -> tuple[jax.Array, jax.Array]:
-        z = image_conv(x, params.kernel, stride)
-        return _activate(params, z, eps), z
+    z = image_conv(x, params.kernel, stride)
 
-    def by_pieces(x: jax.Array, params: Params) -> tuple[jax.Array, jax.Array]:
-        size = _images_at_once(x, params.kernel, stride)
-        return pieces.map_over(lambda x: layer(x, params), size, x)
+    def activate(z: jax.Array, params: Params) -> jax.Array:
+        return _activate(params, z, eps)
 
-    y, z = jax.lax.platform_dependent(x, params, cpu=by_pieces, default=layer)
+    def by_pieces(z: jax.Array, params: Params) -> jax.Array:
+        return pieces.map_over(lambda z: activate(z, params), _images_at_once(z), z)
+
+    y = jax.lax.platform_dependent(z, params, cpu=by_pieces, default=activate)
     return y, (x, params, z)
 
 
@@ -75,7 +76,7 @@ def _image_layer_bwd(
         return grads._replace(kernel=dw)
 
     def by_pieces(x: jax.Array, z: jax.Array, g: jax.Array, params: Params) -> Params:
-        size = _images_at_once(x, params.kernel, stride)
+        size = _images_at_once(z)
         return pieces.sum_over(lambda x, z, g: gradient(x, z, g, params), size, x, z, g)
 
     grads = jax.lax.platform_dependent(x, z, g, params, cpu=by_pieces, default=gradient)
@@ -92,8 +93,6 @@ def _activate(params: Params, z: jax.Array, eps: float) -> jax.Array:
     return jax.nn.relu(z)
 
 
-def _images_at_once(x: jax.Array, kernel: jax.Array, stride: int) -> int:
-    """So many that the layer's output, as floats, stays in the cache."""
-    side, num_out = kernel.shape[0], kernel.shape[-1]
-    rows, columns = ((size - side) // stride + 1 for size in x.shape[1:3])
-    return pieces.size_of(x.shape[0], 4 * rows * columns * num_out)
+def _images_at_once(z: jax.Array) -> int:
+    """So many that one of the layer's arrays, as floats, stays in the cache."""
+    return pieces.size_of(z.shape[0], 4 * math.prod(z.shape[1:]))
