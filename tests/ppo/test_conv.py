@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from carljax.ppo import pieces
 from carljax.ppo.conv import conv, matmul, patch_conv
 from carljax.ppo.image_conv import image_conv
 
@@ -28,8 +29,9 @@ def _data(shape_x, shape_w):
     [(13, 13, 5, 2), (12, 9, 5, 2), (8, 8, 3, 2), (6, 4, 3, 1), (11, 11, 3, 3), (10, 11, 2, 3)],
     ids=["odd", "rows left over", "k3 s2", "stride 1", "stride = kernel", "stride > kernel"],
 )
-def test_conv_equals_the_plain_one_inside_a_scan(height, width, kernel, stride):
-    x, w = _data((2, 3, height, width, 4), (kernel, kernel, 4, 5))
+@pytest.mark.parametrize("channels", [4, 9], ids=["few channels", "more"])
+def test_conv_equals_the_plain_one_inside_a_scan(height, width, kernel, stride, channels):
+    x, w = _data((2, 3, height, width, channels), (kernel, kernel, channels, 5))
 
     def total(function, x, w):
         def step(carry, x):
@@ -50,8 +52,13 @@ def test_conv_equals_the_plain_one_inside_a_scan(height, width, kernel, stride):
     [(13, 13, 5, 2), (11, 16, 5, 2), (12, 10, 3, 2), (9, 9, 5, 1), (8, 20, 8, 4), (7, 9, 2, 3)],
     ids=["odd", "columns left over", "k3 s2", "stride 1", "k8 s4", "stride > kernel"],
 )
-def test_image_conv_equals_the_plain_one_inside_a_scan(height, width, kernel, stride):
-    x, w = _data((2, 3, height, width, 4), (kernel, kernel, 4, 5))
+@pytest.mark.parametrize("channels", [4, 3], ids=["whole vectors", "others"])
+@pytest.mark.parametrize("room", [1 << 20, 1], ids=["all images at once", "one by one"])
+def test_image_conv_equals_the_plain_one_inside_a_scan(
+    monkeypatch, height, width, kernel, stride, channels, room
+):
+    monkeypatch.setattr(pieces, "CACHE_BYTES", room)
+    x, w = _data((2, 3, height, width, channels), (kernel, kernel, channels, 5))
     x = (10 * np.abs(x)).astype(np.uint8)
 
     def total(function, w):
