@@ -7,12 +7,15 @@ import math
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 
 from carljax import build
 from carljax.build import Setup
 from carljax.ppo.rollout import rollout
 from carljax.ppo.types import TrainState, Transition
 from carljax.sim.env import DrivingEnv
+
+_ARRAYS_AT_WORK = 3  # of the backward pass, as large as its largest: cotangents, a copy
 
 
 @dataclasses.dataclass(frozen=True)
@@ -99,7 +102,9 @@ def count(tree: Any) -> int:
 
 
 def activation_bytes(network: Any, params: Any, obs: Any) -> int:
-    """Estimates what a gradient keeps of the forward pass: all that the backward pass will read.
+    """Estimates what a gradient needs: what it keeps of the forward pass, and room to work.
+
+    The room is for the cotangents on both sides of a layer, the largest, and one copy of such.
 
     Args:
       network: a flax module.
@@ -113,7 +118,9 @@ def activation_bytes(network: Any, params: Any, obs: Any) -> int:
     def backward(params: Any, obs: Any) -> Any:
         return jax.vjp(lambda p: network.apply(p, obs), params)[1]
 
-    return tree_bytes(jax.eval_shape(backward, params, obs))
+    kept = jax.tree.leaves(jax.eval_shape(backward, params, obs))
+    floats = [leaf for leaf in kept if jnp.issubdtype(leaf.dtype, jnp.floating)]
+    return tree_bytes(kept) + _ARRAYS_AT_WORK * max(map(_leaf_bytes, floats))
 
 
 def readable(num_bytes: float) -> str:

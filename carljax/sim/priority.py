@@ -343,8 +343,10 @@ def gated(pair: Pairs, may_go: jax.Array) -> jax.Array:
 
 def _of_others(pair: Pairs, values: jax.Array) -> jax.Array:
     """(R, 1) or (R, N): values (M,) of all crossers for those that are looked at."""
-    is_all = pair.others.number.shape[1] == 1
-    return values[:, None] if is_all else values[pair.others.number]
+    number = pair.others.number
+    if number.shape[1] == 1:
+        return values[:, None]
+    return once((values[number], number))[0]  # a look-up among what follows would make that slow
 
 
 def _order(pair: Pairs) -> jax.Array:
