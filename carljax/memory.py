@@ -15,8 +15,6 @@ from carljax.ppo.rollout import rollout
 from carljax.ppo.types import TrainState, Transition
 from carljax.sim.env import DrivingEnv
 
-_ARRAYS_AT_WORK = 3  # of the backward pass, as large as its largest: cotangents, a copy
-
 
 @dataclasses.dataclass(frozen=True)
 class MemoryEstimate:
@@ -67,6 +65,8 @@ def estimate(made: Setup) -> tuple[int, MemoryEstimate]:
         f"activations of {at_once} samples (at most)": activation_bytes(
             made.network, state.params, obs
         ),
+        # The compiler gives rollout and update each room of its own.
+        "layers while acting": forward_bytes(made.network, state.params, state.env_state.obs),
     }
     available = build.memory_of_device(made.mesh)
     return count(state.params), MemoryEstimate(parts, available)
@@ -102,9 +102,7 @@ def count(tree: Any) -> int:
 
 
 def activation_bytes(network: Any, params: Any, obs: Any) -> int:
-    """Estimates what a gradient needs: what it keeps of the forward pass, and room to work.
-
-    The room is for the cotangents on both sides of a layer, the largest, and one copy of such.
+    """Estimates what a gradient keeps of the forward pass: all that the backward pass will read.
 
     Args:
       network: a flax module.
@@ -114,13 +112,31 @@ def activation_bytes(network: Any, params: Any, obs: Any) -> int:
     Returns:
       Bytes; an estimate from above, since the compiler may recompute some of it.
     """
+    return tree_bytes(_kept(network, params, obs))
+
+
+def forward_bytes(network: Any, params: Any, obs: Any) -> int:
+    """Estimates what the network needs to act: the largest layer's input and output at once.
+
+    Args:
+      network: a flax module.
+      params: its variables, or their shapes.
+      obs: a batch of observations, or their shapes.
+
+    Returns:
+      Bytes, without the observations.
+    """
+    kept = _kept(network, params, obs)
+    return 2 * max(_leaf_bytes(leaf) for leaf in kept if jnp.issubdtype(leaf.dtype, jnp.floating))
+
+
+def _kept(network: Any, params: Any, obs: Any) -> list[Any]:
+    """Shapes of what a gradient keeps of the forward pass."""
 
     def backward(params: Any, obs: Any) -> Any:
         return jax.vjp(lambda p: network.apply(p, obs), params)[1]
 
-    kept = jax.tree.leaves(jax.eval_shape(backward, params, obs))
-    floats = [leaf for leaf in kept if jnp.issubdtype(leaf.dtype, jnp.floating)]
-    return tree_bytes(kept) + _ARRAYS_AT_WORK * max(map(_leaf_bytes, floats))
+    return jax.tree.leaves(jax.eval_shape(backward, params, obs))
 
 
 def readable(num_bytes: float) -> str:
