@@ -84,15 +84,20 @@ def test_loops_count_as_often_as_they_run_and_only_the_platforms_own_branch_coun
     assert matmul_flops.of_traced(traced, "gpu") == 2 * 2 * 4**3
 
 
-def test_the_gradient_of_our_convolution_counts_what_the_cpu_computes():
-    """At stride 2 the CPU's input gradient is a convolution with 6 x 6 taps instead of 5 x 5."""
-    x, w = jnp.ones((2, 9, 9, 3), jnp.float32), jnp.ones((5, 5, 3, 4), jnp.float32)
+@pytest.mark.parametrize("channels", [3, 12])
+def test_the_gradient_of_our_convolution_counts_what_the_cpu_computes(channels):
+    x, w = jnp.ones((2, 9, 9, channels)), jnp.ones((5, 5, channels, 4))
     traced = jax.jit(jax.grad(lambda x, w: conv(x, w, 2).sum(), (0, 1))).trace(x, w)
     forward = flops_of(lambda x, w: conv(x, w, 2), x, w)
-    assert forward == 2 * 2 * 4 * 3 * (3 * 5) ** 2
+    assert forward == 2 * 2 * 4 * channels * (3 * 5) ** 2
     # Either gradient is as much again; nobody asks for the value here.
     assert matmul_flops.of_traced(traced, "gpu") == 2 * forward
-    assert matmul_flops.of_traced(traced, "cpu") == forward + forward * (6 / 5) ** 2
+    # At stride 2 the CPU's input gradient is a convolution with 6 x 6 taps instead of 5 x 5. With
+    # few channels its weight gradient multiplies, at 5 rows of the kernel, 2 x 3 rows of 3 blocks
+    # of 4 pixels by the cotangents of 2 + 2 outputs.
+    by_products = 2 * 5 * (2 * 3 * 3) * (4 * channels) * (4 * 4)
+    weights = by_products if channels == 3 else forward
+    assert matmul_flops.of_traced(traced, "cpu") == weights + forward * (6 / 5) ** 2
 
 
 def test_xla_counts_a_loops_body_once_and_we_as_often_as_it_runs():
