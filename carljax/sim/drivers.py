@@ -12,7 +12,8 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from carljax.sim import corridor, idm, lane_shift, priority, vehicles
+from carljax.sim import cars_ahead, corridor, idm, lane_shift, priority, vehicles
+from carljax.sim.cars_ahead import CarsAhead, leaders
 from carljax.sim.corridor import Obstacles
 from carljax.sim.idm import IDMParams
 from carljax.sim.lane_table import CURVE_BRAKING
@@ -54,21 +55,16 @@ def accelerations(
       road_map: the map.
       params: of a car's driver.
     """
-    focus = priority.focus_of(agents, road_map, free.limit)
-    others = priority.crossers(agents, movers, road_map, free.limit)
-    focus = once(focus)
-    others, movers = once((others, movers))
-    pair = priority.pairs(agents, focus, others, road_map)
-    along = lane_gaps(agents, movers, road_map)
-    joined = priority.joined_gaps(pair)
-    gap, leader_speed = _nearer(
-        leaders(along, movers.speed[:, None]), leaders(joined, pair.others.speed)
-    )
     half = 0.5 * agents.length
-    room = priority.has_room(focus, half, along, movers)
+    focus, movers = once(priority.focus_of(agents, road_map, free.limit)), once(movers)
+    along = cars_ahead.look(agents, movers, road_map)
+    room = priority.has_room(focus, half, along)
     may_go = movers.can_go & jnp.append(room & ~_is_in_queue(along, movers), True)
-    may_go = once(may_go | others.is_lawless)
-    waits = priority.gated(pair, may_go) | (~room & (focus.front < priority.ENTERED))
+    others = once(priority.crossers(agents, movers, may_go, road_map, free.limit))
+    pair = priority.pairs(agents, focus, others, road_map)
+    joined = priority.joined_gaps(pair)
+    gap, leader_speed = _nearer(leaders(along.gap, along.speed), leaders(joined, pair.others.speed))
+    waits = priority.gated(pair) | (~room & (focus.front < priority.ENTERED))
     waits &= focus.lane >= 0
     lane_end = road_map.lane_end[jnp.maximum(agents.lanes[:, 0], 0)] - agents.lane_s - half
     ends = jnp.where(agents.lanes[:, 1] < 0, lane_end, FAR)
@@ -98,9 +94,9 @@ def accelerations(
     return jnp.where(agents.valid, accel, 0.0)
 
 
-def _is_in_queue(along: jax.Array, movers: Mover) -> jax.Array:
+def _is_in_queue(along: CarsAhead, movers: Mover) -> jax.Array:
     """(N,) bool, stands behind one that stands: to let it go first could be to wait for ever."""
-    to_queue = jnp.where(movers.is_queued[:, None], along, FAR).min(axis=0)
+    to_queue = jnp.where(along.is_queued, along.gap, FAR).min(axis=0)
     return movers.is_queued[:-1] & (to_queue < QUEUE_GAP)
 
 
@@ -126,36 +122,6 @@ def free_speed(agents: Agents, road_map: RoadMap) -> Free:
         limit=jnp.where(is_scripted, cap, limit[:, 0]),
         speed=jnp.where(is_scripted, cap, speed),
     )
-
-
-def lane_gaps(agents: Agents, movers: Mover, road_map: RoadMap) -> jax.Array:
-    """(M, N) m, bumper gap to every car ahead on an agent's plan; FAR to all others.
-
-    Args:
-      agents: (N,) vehicles.
-      movers: (M,) everybody, the ego last.
-      road_map: the map.
-    """
-    lanes, begin = once((list(agents.lanes.T), list(ahead_of(agents, road_map).begin.T)))
-    other, other_s = movers.lane[:, None], movers.s[:, None]
-    ahead = other_s + begin[0]
-    gap = jnp.where((other == lanes[0]) & (ahead > 0.0), ahead, FAR)
-    gap = jnp.minimum(gap, jnp.where(other == lanes[1], other_s + begin[1], FAR))
-    gap = jnp.minimum(gap, jnp.where(other == lanes[2], other_s + begin[2], FAR))
-    room = movers.half_length[:, None] + 0.5 * agents.length
-    return jnp.where((other >= 0) & (gap < FAR), gap - room, FAR)
-
-
-def leaders(gaps: jax.Array, speed: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Bumper gap to, and speed of, the nearest car ahead: (N,) m, (N,) m/s.
-
-    Args:
-      gaps: (R, N) m to others.
-      speed: (R, 1) or (R, N) m/s of those.
-    """
-    nearest = gaps.min(axis=0)
-    # No search by index, which would cost more than all of the above.
-    return nearest, jnp.where(gaps == nearest, speed, 0.0).max(axis=0)
 
 
 def _nearer(

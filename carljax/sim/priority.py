@@ -15,6 +15,8 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
+from carljax.sim import order
+from carljax.sim.cars_ahead import CarsAhead
 from carljax.sim.junctions import (
     CONFLICT,
     CONFLICT_YIELD,
@@ -41,11 +43,10 @@ PATIENCE = 8.0  # s at rest after which nobody waits for a car that doesn't move
 FOLLOWS = 0.5  # s of headway given to a car before which an agent joins. source: ours
 SHORT = 12.0  # m; nobody waits for room on shorter lanes, such as in roundabouts. source: ours
 ROOM_GAP = 2.0  # m kept to it at rest. source: IDM's gap at rest
-# Of more than MANY cars each agent looks at the NEAREST of its own junction alone, so that cost
-# grows with their number and not with its square. source: ours; with 128 and 256 cars in the
-# training towns, up to 80 of them at one junction, fewer than 1 of 100,000 decisions differed
-MANY, NEAREST = 96, 24
-ORDERED = (192.0, 64.0)  # m before and behind a junction's entry; farther ones count as equal
+# Of many cars each agent looks at the NEAREST of its own junction alone. source: ours; of 256 cars
+# in the training towns, up to 80 at one junction, fewer than 1 of 100,000 decisions differed
+NEAREST = 24
+BEFORE, BEHIND = 192.0, 64.0  # m from a junction's entry, within which they are put in order
 
 
 class Crossers(struct.PyTreeNode):
@@ -61,6 +62,7 @@ class Crossers(struct.PyTreeNode):
       half_length: m.
       wait_s: s at rest.
       is_lawless: bool, drives and stops for nobody.
+      may_go: bool, neither a light, a sign nor want of room keeps it from entering.
     """
 
     number: jax.Array
@@ -71,6 +73,7 @@ class Crossers(struct.PyTreeNode):
     half_length: jax.Array
     wait_s: jax.Array
     is_lawless: jax.Array
+    may_go: jax.Array
 
 
 class Focus(struct.PyTreeNode):
@@ -128,12 +131,15 @@ class Pairs(struct.PyTreeNode):
     half_length: jax.Array
 
 
-def crossers(agents: Agents, movers: Mover, road_map: RoadMap, top_speed: jax.Array) -> Crossers:
+def crossers(
+    agents: Agents, movers: Mover, may_go: jax.Array, road_map: RoadMap, top_speed: jax.Array
+) -> Crossers:
     """Everybody as others see them at junctions.
 
     Args:
       agents: (N,) vehicles.
       movers: (N + 1,) the same and the ego.
+      may_go: (N + 1,) bool, see `Crossers`; of those who stop for somebody.
       road_map: the map.
       top_speed: (N,) m/s, free speeds.
     """
@@ -147,6 +153,8 @@ def crossers(agents: Agents, movers: Mover, road_map: RoadMap, top_speed: jax.Ar
     before = movers.s - road_map.lane_length[lane]
     after = movers.s + road_map.lane_length[jnp.maximum(past, 0)]
     bend = road_map.lane_curve_speed[jnp.maximum(way, 0)]
+    # One that stands in a queue will not come: to wait for it could be to wait for ever.
+    is_lawless = jnp.append(agents.is_lawless, False) & ~movers.is_queued
     # The ego may be as fast as it likes.
     return Crossers(
         number=jnp.arange(way.shape[0]),
@@ -156,8 +164,8 @@ def crossers(agents: Agents, movers: Mover, road_map: RoadMap, top_speed: jax.Ar
         top_speed=jnp.minimum(jnp.append(top_speed, 40.0), 1.2 * bend),
         half_length=movers.half_length,
         wait_s=jnp.append(agents.wait_s, 0.0),
-        # One that stands in a queue will not come: to wait for it could be to wait for ever.
-        is_lawless=jnp.append(agents.is_lawless, False) & ~movers.is_queued,
+        is_lawless=is_lawless,
+        may_go=may_go | is_lawless,
     )
 
 
@@ -192,18 +200,18 @@ def focus_of(agents: Agents, road_map: RoadMap, top_speed: jax.Array) -> Focus:
 def pairs(agents: Agents, focus: Focus, others: Crossers, road_map: RoadMap) -> Pairs:
     """Looks up how each focus meets each lane of others.
 
-    Of more than `MANY` others these are for each focus the `NEAREST` of its junction.
+    Of more than `order.MANY` others these are for each focus the `NEAREST` of its junction.
     """
-    if others.lane.shape[0] > MANY:
+    if others.lane.shape[0] > order.MANY:
         others = once(_nearest(focus, others, road_map))
         slot = road_map.lane_slot[jnp.maximum(others.lane, 0)]
         meeting = once(road_map.lane_meeting[jnp.maximum(focus.lane, 0), :, slot])
-        found = (meeting[..., 0], meeting[..., 1])
+        found, same = (meeting[..., 0], meeting[..., 1]), others.lane >= 0
     else:
         found = _meetings(focus, others, road_map)
         others = jax.tree.map(lambda x: x[:, None], others)
-    junction = _junction(others.lane, road_map)
-    same = (junction >= 0) & (junction == _junction(focus.lane, road_map))
+        junction = _junction(others.lane, road_map)
+        same = (junction >= 0) & (junction == _junction(focus.lane, road_map))
     mine, theirs = (jnp.where(same, number.astype(jnp.int32), 0) for number in found)
     relation = (mine >> 2) & 3
     return Pairs(
@@ -241,21 +249,13 @@ def _meetings(focus: Focus, others: Crossers, road_map: RoadMap) -> tuple[jax.Ar
 def _nearest(focus: Focus, others: Crossers, road_map: RoadMap) -> Crossers:
     """(NEAREST, N) crossers of each focus's junction: the farthest on their way come first.
 
-    Where they are fewer, others follow, which are of other junctions or of none.
+    Where they are fewer, the rest are on no lane.
     """
-    num, num_junctions = others.lane.shape[0], road_map.lane_junction.shape[0]  # no more than lanes
-    bits = 31 - num.bit_length() - num_junctions.bit_length()
-    steps = jnp.int32(2**bits / sum(ORDERED) * (ORDERED[1] - others.s))
-    steps = jnp.clip(steps, 0, 2**bits - 1)
-    # Junction, way and number in one: a CPU sorts plain integers ten times as fast as tuples.
-    rows = ((1 + _junction(others.lane, road_map)) << bits) + steps
-    sort = jnp.sort((rows << num.bit_length()) + others.number)
-    begin = (1 + _junction(focus.lane, road_map)) << (bits + num.bit_length())
-    place = jnp.searchsorted(sort, begin, method="scan_unrolled") + jnp.arange(NEAREST)[:, None]
-    number = sort[jnp.minimum(place, num - 1)] & (2 ** num.bit_length() - 1)
-    found = jax.tree.map(lambda x: x[number], others)
-    # The last one of all only once.
-    return found.replace(lane=jnp.where(place < num, found.lane, -1))
+    num_junctions = road_map.lane_junction.shape[0]  # no more than lanes
+    junction = _junction(others.lane, road_map)
+    all_cars = order.sort(junction, BEHIND - others.s, others, num_junctions, BEFORE + BEHIND)
+    found, is_there = order.following(all_cars, _junction(focus.lane, road_map), 0.0, NEAREST)
+    return found.replace(lane=jnp.where(is_there, found.lane, -1))
 
 
 def _stretch(enter: jax.Array, leave: jax.Array) -> Stretch:
@@ -301,7 +301,7 @@ def stretch_gaps(pair: Pairs) -> jax.Array:
     return jnp.where(blocked, pair.mine.enter - focus.front, FAR).min(axis=0)
 
 
-def has_room(focus: Focus, half_length: jax.Array, gaps: jax.Array, movers: Mover) -> jax.Array:
+def has_room(focus: Focus, half_length: jax.Array, along: CarsAhead) -> jax.Array:
     """(N,) bool: behind those who stand an agent would come to rest beyond the junction.
 
     Those who drive between it and the first one that stands will stop there as well. On a short
@@ -311,24 +311,18 @@ def has_room(focus: Focus, half_length: jax.Array, gaps: jax.Array, movers: Move
     Args:
       focus: of each agent.
       half_length: (N,) m.
-      gaps: (M, N) m to cars ahead on its plan, FAR to others.
-      movers: (M,) everybody.
+      along: cars ahead on its plan.
     """
-    to_queue = jnp.where(movers.is_queued[:, None], gaps, FAR).min(axis=0)
-    space = 2.0 * movers.half_length[:, None] + ROOM_GAP
-    taken = jnp.where(gaps < to_queue, space, 0.0).sum(axis=0)
+    to_queue = jnp.where(along.is_queued, along.gap, FAR).min(axis=0)
+    space = 2.0 * along.half_length + ROOM_GAP
+    taken = jnp.where(along.gap < to_queue, space, 0.0).sum(axis=0)
     rests = focus.front + to_queue - taken - ROOM_GAP
     is_free = (to_queue >= FAR) | (rests > focus.length + 2.0 * half_length)
     return ~focus.can_wait | is_free
 
 
-def gated(pair: Pairs, may_go: jax.Array) -> jax.Array:
-    """(N,) bool: others go first into the junction that an agent is about to enter.
-
-    Args:
-      pair: of everybody.
-      may_go: (M,) bool, neither a light, a sign nor want of room keeps it from entering.
-    """
+def gated(pair: Pairs) -> jax.Array:
+    """(N,) bool: others go first into the junction that an agent is about to enter."""
     theirs, focus, others = pair.theirs, pair.focus, pair.others
     front = others.s + others.half_length
     has_entered = front > ENTERED
@@ -342,17 +336,9 @@ def gated(pair: Pairs, may_go: jax.Array) -> jax.Array:
     margin = jnp.clip(MARGIN * PATIENCE / (PATIENCE + pair.wait_s), LEAST_MARGIN, MARGIN)
     yields = (pair.owes == CONFLICT_YIELD) | others.is_lawless
     yields |= (pair.owes == CONFLICT) & _is_earlier(pair)
-    coming = ~has_entered & _of_others(pair, may_go) & yields & _collides(pair, margin)
+    coming = ~has_entered & others.may_go & yields & _collides(pair, margin)
     waits = (pair.owes != FREE) & (inside | (coming & ~(stands & first)))
     return waits.any(axis=0) & (focus.front < ENTERED)
-
-
-def _of_others(pair: Pairs, values: jax.Array) -> jax.Array:
-    """(R, 1) or (R, N): values (M,) of all crossers for those that are looked at."""
-    number = pair.others.number
-    if number.shape[1] == 1:
-        return values[:, None]
-    return once((values[number], number))[0]  # a look-up among what follows would make that slow
 
 
 def _order(pair: Pairs) -> jax.Array:

@@ -24,7 +24,7 @@ from traffic_world import (
     overlaps_jit,
 )
 
-from carljax.sim import drivers, lights, priority, right_of_way
+from carljax.sim import drivers, lights, order, priority, right_of_way
 from carljax.sim.junctions import FORK, FREE, MERGE
 
 # Cars are 4 m long. Lanes straight on are 20 m long and run 1.75 m beside the middle, so that from
@@ -69,7 +69,7 @@ def pairs_jit(agents, road_map):
     )
     limit = drivers.free_speed(agents, road_map).limit
     focus = priority.focus_of(agents, road_map, limit)
-    others = priority.crossers(agents, movers, road_map, limit)
+    others = priority.crossers(agents, movers, movers.can_go, road_map, limit)
     return priority.pairs(agents, focus, others, road_map)
 
 
@@ -128,7 +128,7 @@ def test_of_many_only_those_of_the_same_junction_are_looked_at(world, monkeypatc
     given = (world.map, agents, f32(0.0), jax.random.key(0), make_ego(), ego_place())
     full = jax.jit(functools.partial(drive, num_steps=STEPS))(*given)
     assert full.wait_s.max() > 2.0 and full.lane_s[-1].std() > 1.0  # some had to wait
-    monkeypatch.setattr(priority, "MANY", 4)
+    monkeypatch.setattr(order, "MANY", 4)
     some = jax.jit(functools.partial(drive, num_steps=STEPS))(*given)
     for name in ("lane_s", "speed", "wait_s", "lanes"):
         np.testing.assert_allclose(getattr(some, name), getattr(full, name), atol=1e-3)

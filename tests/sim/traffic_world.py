@@ -10,7 +10,16 @@ import jax.numpy as jnp
 import numpy as np
 from small_world import LIMIT, approach, crossing, inner, leaving, road
 
-from carljax.sim import drivers, geometry, lights, population, priority, right_of_way, traffic
+from carljax.sim import (
+    cars_ahead,
+    drivers,
+    geometry,
+    lights,
+    population,
+    priority,
+    right_of_way,
+    traffic,
+)
 from carljax.sim import road_map_builder as builder
 from carljax.sim import town as towns_module
 from carljax.sim.idm import IDMParams
@@ -177,7 +186,7 @@ def _pairs(agents, movers, road_map):
     """Everybody where lanes meet: all pairs, and what each agent looks at."""
     free = drivers.free_speed(agents, road_map)
     focus = priority.focus_of(agents, road_map, free.limit)
-    others = priority.crossers(agents, movers, road_map, free.limit)
+    others = priority.crossers(agents, movers, movers.can_go, road_map, free.limit)
     return priority.pairs(agents, focus, others, road_map), focus
 
 
@@ -185,8 +194,8 @@ def _pairs(agents, movers, road_map):
 def leaders_jit(agents, stop, ego, place, road_map):
     clock = lights.clock(f32(0.0), 0)
     movers = right_of_way.all_movers(agents, stop, ego, f32(EGO_LENGTH), place, road_map, clock)
-    gaps = drivers.lane_gaps(agents, movers, road_map)
-    return drivers.leaders(gaps, movers.speed[:, None])
+    along = cars_ahead.look(agents, movers, road_map)
+    return cars_ahead.leaders(along.gap, along.speed)
 
 
 @jax.jit
@@ -207,7 +216,7 @@ stop_ahead_jit = jax.jit(right_of_way.stop_ahead)
 def gated_jit(agents, stop, ego, place, road_map, clock):
     movers = right_of_way.all_movers(agents, stop, ego, f32(EGO_LENGTH), place, road_map, clock)
     pair, focus = _pairs(agents, movers, road_map)
-    return priority.gated(pair, movers.can_go) & (focus.lane >= 0)
+    return priority.gated(pair) & (focus.lane >= 0)
 
 
 def is_gated(world, agents, time=0.0, ego=None, place=None):
