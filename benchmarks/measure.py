@@ -60,6 +60,51 @@ class Workload:
     num_devices: int = 1
 
 
+@dataclasses.dataclass(frozen=True)
+class Ready:
+    """A workload that is compiled; the operations of its products and convolutions in a call."""
+
+    workload: Workload
+    compiled: Any
+    matmul_flops: float
+
+
+def prepare(workload: Workload) -> Ready:
+    """Compiles a workload."""
+    traced = workload.program.trace(*workload.given)
+    flops = matmul_flops.of_traced(traced, jax.default_backend())
+    return Ready(workload, traced.lower().compile(), flops)
+
+
+def call(ready: Ready, repeats: int, warm_up: int = 1) -> list[float]:
+    """Times calls, each on what follows from the one before; see `timing.call_seconds`."""
+    workload = ready.workload
+
+    def arguments(result: Any) -> tuple:
+        if result is None or workload.follow is None:
+            return workload.given
+        return workload.follow(result)
+
+    return timing.call_seconds(ready.compiled, arguments, repeats, warm_up)
+
+
+def describe(ready: Ready, seconds: Sequence[float]) -> dict[str, Any]:
+    """Describes a workload whose calls took so many seconds; see `run`."""
+    workload, taken = ready.workload, spread(seconds)
+    # Devices made on a CPU share its cores.
+    num_peaks = 1 if jax.default_backend() == "cpu" else workload.num_devices
+    speed = ready.matmul_flops / taken["median"]
+    return {
+        "benchmark": workload.name,
+        **{f"{unit}_per_s": num / taken["median"] for unit, num in workload.units.items()},
+        "seconds": taken,
+        "matmul_flops": ready.matmul_flops,
+        "matmul_peak_share": speed / (num_peaks * matmul_peak()),
+        "xla": xla_cost.of(ready.compiled),
+        **workload.sizes,
+    }
+
+
 def run(workload: Workload, repeats: int) -> dict[str, Any]:
     """Compiles, times and describes one workload.
 
@@ -76,27 +121,8 @@ def run(workload: Workload, repeats: int) -> dict[str, Any]:
       UsageError: too few repeats.
     """
     check_repeats(repeats)
-    traced = workload.program.trace(*workload.given)
-    compiled = traced.lower().compile()
-    flops = matmul_flops.of_traced(traced, jax.default_backend())
-
-    def arguments(result: Any) -> tuple:
-        if result is None or workload.follow is None:
-            return workload.given
-        return workload.follow(result)
-
-    seconds = spread(timing.call_seconds(compiled, arguments, repeats))
-    # Devices made on a CPU share its cores.
-    num_peaks = 1 if jax.default_backend() == "cpu" else workload.num_devices
-    return {
-        "benchmark": workload.name,
-        **{f"{unit}_per_s": num / seconds["median"] for unit, num in workload.units.items()},
-        "seconds": seconds,
-        "matmul_flops": flops,
-        "matmul_peak_share": flops / seconds["median"] / (num_peaks * matmul_peak()),
-        "xla": xla_cost.of(compiled),
-        **workload.sizes,
-    }
+    ready = prepare(workload)
+    return describe(ready, call(ready, repeats))
 
 
 def check_repeats(repeats: int) -> None:

@@ -1,9 +1,11 @@
 """How cost grows: `python benchmarks/scaling.py`, one JSON line a point and one for each axis.
 
 Along each axis one size grows and all else stays; a line has the cost of a step of all environments
-(for devices: of a training update) and its ratio to the point before. Doubling environments, agents
-or images may cost 2.2 times as much at most once the cores are full, that is from the first size on
-whose throughput is within a fifth of the best on its axis. The status is 1 where it costs more.
+(for devices: of a training update) and its ratio to the point before. Calls of both are timed in
+turn (devices: one after the other), since many a machine does not keep its speed. Doubling
+environments, agents or images may cost 2.2 times as much at most once the cores are full, that is
+from the first size on whose throughput is within a fifth of the best on its axis. The status is 1
+where it costs more.
 """
 
 from __future__ import annotations
@@ -67,11 +69,12 @@ class Command:
     """Steps of a timed call."""
     num_routes: int = 32
     """Routes in the bank."""
-    repeats: int = 5
+    repeats: int = 15
     """Timed calls, at least 5."""
 
 
 Point = dict[str, Any]
+Last = dict[str, measure.Ready]
 
 
 def main() -> int:
@@ -117,16 +120,17 @@ def with_ratios(points: Iterator[Point]) -> Iterator[Point]:
     """Adds to each point how many times the cost and the size of the one before it has.
 
     Args:
-      points: with `size`, `cost_s` and `series`; the first of a series has nothing before it.
+      points: with `size`, `cost_s` and `series`; the first of a series has nothing before it. With
+        a `cost_ratio` of their own if both were timed in turn.
     """
     last: dict[str, Point] = {}
     for point in points:
         before = last.get(point["series"])
         last[point["series"]] = point
         yield {
-            **point,
-            "size_ratio": point["size"] / before["size"] if before else None,
             "cost_ratio": point["cost_s"] / before["cost_s"] if before else None,
+            "size_ratio": point["size"] / before["size"] if before else None,
+            **point,
         }
 
 
@@ -168,41 +172,45 @@ def per_double(point: Point) -> float:
 def agents(command: Command) -> Iterator[Point]:
     """The simulator with more and more traffic."""
     towns = [load(bundled.path(name)) for name in bundled.TRAINING]
+    last: Last = {}
     for num in command.agents:
         env = workloads.environment(presets.CPU, towns, command.num_routes, num)
-        yield point(command, workloads.sim(env, command.num_envs, command.num_steps), num)
+        yield point(command, workloads.sim(env, command.num_envs, command.num_steps), num, last)
 
 
 def envs(command: Command) -> Iterator[Point]:
     """The simulator with more and more environments."""
     towns = [load(bundled.path(name)) for name in bundled.TRAINING]
     env = workloads.environment(presets.CPU, towns, command.num_routes, command.num_agents)
+    last: Last = {}
     for num in command.envs:
-        yield point(command, workloads.sim(env, num, command.num_steps), num)
+        yield point(command, workloads.sim(env, num, command.num_steps), num, last)
 
 
 def image(command: Command) -> Iterator[Point]:
     """The observation with more and more pixels; a smaller image sees less far."""
     towns = [load(bundled.path(name)) for name in bundled.TRAINING]
+    last: Last = {}
     for side in command.sides:
         raster = RasterConfig(side, side, ego_from_bottom_px=round(side * 100 / 256))
         env = workloads.environment(
             presets.CPU, towns, command.num_routes, IMAGE_AGENTS, raster=raster
         )
         workload = workloads.render(env, command.num_envs, command.num_steps)
-        yield point(command, workload, side * side)
+        yield point(command, workload, side * side, last)
 
 
 def maps(command: Command) -> Iterator[Point]:
     """Simulator and observation in one town after the other; sizes are kilometres of lane."""
     towns = [town(name) for name in command.maps]
+    last: Last = {}
     for there in towns:
         kilometres = float(there.lanes.length.sum()) / 1000.0
         env = workloads.environment(
             presets.CPU, [there], command.num_routes, command.num_agents, raster=RasterConfig()
         )
         for make in (workloads.sim, workloads.render):
-            made = point(command, make(env, command.num_envs, command.num_steps), kilometres)
+            made = point(command, make(env, command.num_envs, command.num_steps), kilometres, last)
             pixels = np.asarray(env.bank.road_map.picture_size)[0].tolist()
             yield {**made, "map": there.network.name, "atlas_shape": pixels}
 
@@ -241,11 +249,28 @@ def devices(command: Command) -> Iterator[Point]:
         yield {**line, "benchmark": "scaling", "series": "end_to_end", "size": num, "cost_s": cost}
 
 
-def point(command: Command, workload: Workload, size: float) -> Point:
-    """Measures one point of an axis; its cost is that of a step of all environments."""
-    line = measure.run(workload, command.repeats)
-    cost = line["seconds"]["median"] / command.num_steps
-    return {**line, "benchmark": "scaling", "series": workload.name, "size": size, "cost_s": cost}
+def point(command: Command, workload: Workload, size: float, last: Last) -> Point:
+    """Measures one point of an axis; its cost is that of a step of all environments.
+
+    Args:
+      command: what to measure.
+      workload: the program.
+      size: the point.
+      last: the point before of each series, which is timed in turn with this one; this one then.
+    """
+    ready, before = measure.prepare(workload), last.get(workload.name)
+    last[workload.name] = ready
+    seconds, ratios = measure.call(ready, 1), []
+    for _ in range(command.repeats - 1):
+        between = measure.call(before, 1, warm_up=0)[0] if before else None
+        seconds += measure.call(ready, 1, warm_up=0)
+        if between:
+            ratios.append(0.5 * (seconds[-2] + seconds[-1]) / between)
+    line = {**measure.describe(ready, seconds), "series": workload.name, "size": size}
+    line["cost_s"] = line["seconds"]["median"] / command.num_steps
+    if ratios:
+        line["cost_ratio"] = measure.spread(ratios)["median"]
+    return {**line, "benchmark": "scaling"}
 
 
 AXES: dict[Axis, Callable[[Command], Iterator[Point]]] = {

@@ -295,6 +295,24 @@ def test_points_are_compared_within_their_series():
     assert ratios == [None, None, 3.0]
 
 
+def test_points_are_timed_in_turn_with_the_one_before(monkeypatch):
+    """So that a machine which slows down to a quarter meanwhile changes no ratio."""
+    slow = [4.0 ** (k / 50) for k in range(100)]
+    workloads = [measure.Workload("sim", None, (), {}, {"seconds": s}) for s in (1.0, 2.0)]
+
+    def call(ready, repeats, warm_up=1):
+        return [ready.sizes["seconds"] * slow.pop(0) for _ in range(warm_up + repeats)][warm_up:]
+
+    monkeypatch.setattr(measure, "prepare", lambda workload: workload)
+    monkeypatch.setattr(measure, "call", call)
+    monkeypatch.setattr(measure, "describe", lambda _, s: {"seconds": measure.spread(s)})
+    last, command = {}, scaling.Command(num_steps=10)
+    first, second = (scaling.point(command, w, 8, last) for w in workloads)
+    assert first["seconds"]["num"] == second["seconds"]["num"] == command.repeats
+    assert "cost_ratio" not in first and second["cost_ratio"] == pytest.approx(2.0, rel=1e-3)
+    assert second["cost_s"] / first["cost_s"] > 2.2
+
+
 @pytest.mark.parametrize(
     ("module", "args", "reason"),
     [
