@@ -39,10 +39,6 @@ LEVELS = {
 }
 ROUTE_AHEAD = 150  # route points. source: the authors' code
 
-# Farther apart and a pixel, whatever its rotation, could slip between samples (a square of side 1
-# holds a circle of diameter 1, and that is the diagonal of the sample grid's cell).
-_SAMPLE_STEP = 0.7  # px
-
 # No index here is negative, and saying so makes the gather over the atlas a fifth faster.
 GATHER: dict[str, Any] = {"mode": "promise_in_bounds", "wrap_negative_indices": False}
 NOWHERE = -1e6  # a row of what is not shown: outside any image, whatever is added
@@ -165,7 +161,7 @@ def box_pixels(
     limits: tuple[float, float],
     config: RasterConfig,
 ) -> jax.Array:
-    """Pixels of boxes, by a grid of sample points in each.
+    """Pixels of boxes, by sample points in each.
 
     The outermost samples lie half a pixel inside the border, so that a box along the axes covers
     just the pixels whose centres it holds.
@@ -182,9 +178,7 @@ def box_pixels(
       (K, S) int32 flat pixel indices.
     """
     px = config.pixels_per_metre
-    steps = [math.ceil(max(limit * px - 1.0, 0.0) / _SAMPLE_STEP) for limit in limits]
-    lines = [np.linspace(-1.0, 1.0, n + 1) if n else np.zeros(1) for n in steps]
-    along, across = np.stack(np.meshgrid(*lines), axis=0).reshape(2, -1)
+    along, across = _samples(*(max(limit * px - 1.0, 0.0) for limit in limits))
     half_length = jnp.maximum(0.5 * length * px - 0.5, 0.0)
     half_width = jnp.maximum(0.5 * width * px - 0.5, 0.0)
     row, column, cos, sin = middle
@@ -195,6 +189,37 @@ def box_pixels(
         spread((column, -sin * half_length, -cos * half_width), grid),
         config,
     )
+
+
+def _samples(length: float, width: float) -> np.ndarray:
+    """(2, S) along and across, in -1 ... 1: as few points as leave no pixel within a box out.
+
+    A pixel, whatever its rotation, holds a circle of diameter 1 px: so no place may be farther than
+    half a pixel from all points. Fewest of them do that in rows, each second one shifted by half a
+    step and with points at both ends: with rows h apart and steps w, the three points around a
+    place are at most half a pixel from it where (w / 2)^2 + h^2 <= h.
+
+    Args:
+      length: px between the outermost points.
+      width: px, likewise.
+    """
+    rows = [_rows(length, width, num) for num in range(2 * math.ceil(width) + 2)]
+    rows += [_rows(width, length, num)[::-1] for num in range(2 * math.ceil(length) + 2)]
+    return min((points for points in rows if points.size), key=lambda points: points.shape[1])
+
+
+def _rows(length: float, width: float, num: int) -> np.ndarray:
+    """(2, S) points on rows along the length, so many spaces apart; none where those are wide."""
+    apart = width / max(num, 1)
+    if apart >= 1.0 or (num == 0) != (width == 0.0):
+        return np.zeros((2, 0))
+    step = 2.0 * math.sqrt(apart - apart**2) if num else 1.0
+    steps = math.ceil(length / step)
+    ends = np.linspace(-1.0, 1.0, steps + 1) if steps else np.zeros(1)
+    shifted = np.union1d(0.5 * (ends[1:] + ends[:-1]), ends[[0, -1]])
+    along = [shifted if row % 2 else ends for row in range(num + 1)]
+    across = np.linspace(-1.0, 1.0, num + 1) if num else np.zeros(1)
+    return np.stack([np.concatenate(along), np.repeat(across, [len(points) for points in along])])
 
 
 def ray_pixels(begin: Poses, length: jax.Array, longest: float, config: RasterConfig) -> jax.Array:

@@ -361,6 +361,21 @@ def random_scene(seed, slots=24):
     return ego, agents_of(*users, slots=slots), route, signals
 
 
+@pytest.mark.parametrize(
+    ("length", "width"),
+    [(11.0, 3.8), (19.8, 4.2), (1.0, 1.0), (0.5, 3.8), (3.8, 0.5), (0.0, 3.0), (3.0, 0.0), (0, 0)],
+)
+def test_no_place_in_a_box_is_half_a_pixel_from_all_samples(length, width):
+    # A grid would take steps of 0.7 px both ways: half a pixel is half of its cell's diagonal.
+    points = raster_canvas._samples(length, width)
+    assert points.shape[1] <= (np.ceil(length / 0.7) + 1) * (np.ceil(width / 0.7) + 1) + 1
+    size = np.array([length, width]) / 2
+    places = np.stack(np.meshgrid(*np.linspace(-size, size, 150).T), axis=-1).reshape(-1, 1, 2)
+    away = np.linalg.norm(places - points.T * size, axis=-1)
+    assert away.min(axis=1).max() <= 0.5
+    assert np.abs(points).max() <= 1.0
+
+
 @pytest.mark.parametrize("config", [CONFIG, SMALL], ids=["256 at 2 px/m", "64 at 1 px/m"])
 @pytest.mark.parametrize("seed", [0, 1])
 def test_random_scenes_match_the_oracle(world, config, seed):
