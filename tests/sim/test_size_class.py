@@ -156,7 +156,8 @@ def test_a_padded_world_is_driven_bit_for_bit_as_it_was(driven):
     assert np.asarray(exact[0].pipeline_state.ego.speed).min() > 1.0
     assert np.asarray(exact[0].pipeline_state.scenarios.index).max() >= 0
     if _IS_CHEAP:
-        chex.assert_trees_all_close(exact, padded, rtol=1e-5)
+        # A reward is a difference of nearly equal numbers.
+        chex.assert_trees_all_close(exact, padded, rtol=1e-5, atol=1e-6)
     else:
         jax.tree.map(np.testing.assert_array_equal, exact, padded)
 
