@@ -1,7 +1,7 @@
 """Cars in the order in which they follow one another, where there are too many to look at all.
 
 One integer holds way, place and number of a car: a CPU sorts plain integers ten times as fast as
-tuples. So many cars are next to a place as are looked for, which are few.
+tuples. Then the cars next to a place stand side by side.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from flax import struct
 from carljax.sim.once import once
 
 MANY = 96  # cars, from which on looking at all pairs costs more. source: ours, measured
+_LEAST_PLACE_BITS = 6  # of a key: on a lane of a kilometre, 16 m
 
 
 class Order(struct.PyTreeNode):
@@ -45,9 +46,14 @@ def sort(way: jax.Array, place: jax.Array, cars: Any, num_ways: int, reach: floa
       num_ways: more than any way.
       reach: m, the largest place that is told from others, to a fraction of it that depends on how
         many cars and ways there are: of 256 cars on 2,048 lanes to 1 / 1,024.
+
+    Raises:
+      ValueError: too many cars on too many ways for one integer.
     """
     num = way.shape[0]
     place_bits = 31 - num.bit_length() - num_ways.bit_length()
+    if place_bits < _LEAST_PLACE_BITS:
+        raise ValueError(f"{num} cars on {num_ways} lanes are too many to be put in order")
     order = Order(way, way, cars, reach, place_bits)
     keys = jnp.sort(_key(order, way, place) + jnp.arange(num))
     number = keys & (2 ** num.bit_length() - 1)

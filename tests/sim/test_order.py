@@ -43,3 +43,10 @@ def test_all_beyond_the_reach_are_at_its_end():
     assert cars.cars.tolist() == [3, 0, 1, 2]
     found, is_there = order.following(cars, jnp.array(0), jnp.array(1e9), 3)
     assert found[is_there].tolist() == [1, 2]
+
+
+def test_more_than_fit_are_refused():
+    cars = jnp.zeros(1 << 10, jnp.int32)
+    with pytest.raises(ValueError, match="1024 cars on 65536 lanes"):
+        order.sort(cars, cars, cars, 1 << 16, REACH)
+    assert order.sort(cars, cars, cars, (1 << 14) - 1, REACH).place_bits == 6
