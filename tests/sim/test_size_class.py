@@ -156,8 +156,10 @@ def test_a_padded_world_is_driven_bit_for_bit_as_it_was(driven):
     assert np.asarray(exact[0].pipeline_state.ego.speed).min() > 1.0
     assert np.asarray(exact[0].pipeline_state.scenarios.index).max() >= 0
     if _IS_CHEAP:
-        # A reward is a difference of nearly equal numbers.
-        chex.assert_trees_all_close(exact, padded, rtol=1e-5, atol=1e-6)
+        sims = (state.pipeline_state for state, _ in (exact, padded))
+        chex.assert_trees_all_close(*sims, rtol=1e-5)
+        # The lane's factor is 1 less nearly as much, so its error is that of numbers near 1.
+        chex.assert_trees_all_close(exact, padded, rtol=1e-5, atol=3e-6)
     else:
         jax.tree.map(np.testing.assert_array_equal, exact, padded)
 
