@@ -12,8 +12,9 @@ from carljax.sim.right_of_way import FAR, Mover, ahead_of
 from carljax.sim.road_map import RoadMap
 from carljax.sim.types import Agents
 
-NEXT = 8  # cars on each lane of its plan, which an agent looks at of many. source: ours
-REACH = 1024.0  # m along a lane, within which many cars are put in order. source: ours
+# Cars on each lane of its plan, which an agent looks at of many. source: ours; of 256 cars in the
+# training towns no decision differed
+NEXT = 8
 
 
 class CarsAhead(struct.PyTreeNode):
@@ -35,7 +36,7 @@ class CarsAhead(struct.PyTreeNode):
 
 
 def look(agents: Agents, movers: Mover, road_map: RoadMap) -> CarsAhead:
-    """Finds the cars on the three lanes of each plan; of more than `MANY` the next on each.
+    """Finds the cars on the three lanes of each plan; of more than `order.MANY` the next on each.
 
     Args:
       agents: (N,) vehicles.
@@ -64,8 +65,8 @@ def _next(agents: Agents, movers: Mover, road_map: RoadMap) -> CarsAhead:
     """The next on each lane, 3 NEXT rows."""
     lanes, begin = agents.lanes.T, ahead_of(agents, road_map).begin.T  # (3, N)
     seen = (movers.s, movers.speed, movers.half_length, movers.is_queued)
-    num_lanes = road_map.lane_length.shape[0]
-    all_cars = order.sort(movers.lane, movers.s, seen, num_lanes, REACH)
+    length = road_map.lane_length
+    all_cars = order.sort(movers.lane, movers.s, seen, length.shape[0], length.max())
     start = jnp.maximum(-begin, 0.0)  # where it is on its own lane, the beginnings of the others
     (s, speed, half, is_queued), on_lane = order.following(all_cars, lanes, start, NEXT)
     gap = jnp.where(on_lane & (s + begin > 0.0), s + begin - (half + 0.5 * agents.length), FAR)

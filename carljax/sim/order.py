@@ -25,18 +25,20 @@ class Order(struct.PyTreeNode):
       keys: (M,) int32, sorted: way, place on it and number of a car.
       way: (M,) int32, where they are.
       cars: what is known of them, in that order.
-      reach: m, static; what lies before 0 or beyond counts as equal to these.
+      reach: m; what lies before 0 or beyond counts as equal to these.
       place_bits: static, of a key.
     """
 
     keys: jax.Array
     way: jax.Array
     cars: Any
-    reach: float = struct.field(pytree_node=False)
+    reach: jax.Array | float
     place_bits: int = struct.field(pytree_node=False)
 
 
-def sort(way: jax.Array, place: jax.Array, cars: Any, num_ways: int, reach: float) -> Order:
+def sort(
+    way: jax.Array, place: jax.Array, cars: Any, num_ways: int, reach: jax.Array | float
+) -> Order:
     """Sorts cars by way, and by place on it.
 
     Args:

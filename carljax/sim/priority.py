@@ -46,7 +46,7 @@ ROOM_GAP = 2.0  # m kept to it at rest. source: IDM's gap at rest
 # Of many cars each agent looks at the NEAREST of its own junction alone. source: ours; of 256 cars
 # in the training towns, up to 80 at one junction, fewer than 1 of 100,000 decisions differed
 NEAREST = 24
-BEFORE, BEHIND = 192.0, 64.0  # m from a junction's entry, within which they are put in order
+BEFORE, BEHIND = 192.0, 64.0  # m from a junction's entry where they are put in order. source: ours
 
 
 class Crossers(struct.PyTreeNode):
